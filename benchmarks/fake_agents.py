@@ -17,7 +17,8 @@ from fiber._agent.interface import ChildObserver, ChildSpec, ExitReport
 from fiber._agent.worker import Worker
 from fiber._transport.loop import Loop
 from fiber._wire import work
-from fiber._wire.packet import BytesLike, Message
+from fiber._wire.memory_files import BytesLike
+from fiber._wire.packet import Message
 
 _READY = pickle.dumps((work.READY,))
 _BOARD = 16

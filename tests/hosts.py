@@ -14,7 +14,7 @@ from fiber._hub.hub import Hub, HubLink
 from fiber._runtime.state import runtime
 from fiber._transport.loop import Loop
 from fiber._wire import messages
-from fiber._wire.messages import OfHubs
+from fiber._wire.messages import HubMessage
 from patience import PATIENCE
 
 
@@ -27,7 +27,7 @@ class Wire:
         self.held: deque[bytes] | None = None
         self.frames = 0
 
-    def send(self, frame: OfHubs) -> None:
+    def send(self, frame: HubMessage) -> None:
         """On the loop's thread, as links are used."""
         self.frames += 1
         encoded = frame.encode()
@@ -49,7 +49,7 @@ class Wire:
     def _deliver(self, encoded: bytes) -> None:
         if self.to is not None:
             frame = messages.decode(bytearray(encoded))
-            assert isinstance(frame, OfHubs)
+            assert isinstance(frame, HubMessage)
             self.to.on_frame(frame)
 
 

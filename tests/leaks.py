@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import census
 from fiber._hub.heap import SIZES
-from fiber._wire.arena import RETAINED_BLOCKS
+from fiber._wire.memory_files import RETAINED_BLOCKS
 from patience import PATIENCE
 
 SETTLE = PATIENCE  # seconds for processes, threads and files that are ending to end

@@ -21,7 +21,8 @@ from fiber._hub import handles, one_way
 from fiber._transport.base import Channel
 from fiber._transport.unix import UnixChannel
 from fiber._wire import packet
-from fiber._wire.packet import BytesLike, Message
+from fiber._wire.memory_files import BytesLike
+from fiber._wire.packet import Message
 from fiber.errors import BufferTooShort, ConnectionClosed
 
 if TYPE_CHECKING:

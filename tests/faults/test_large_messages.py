@@ -20,7 +20,7 @@ from faults import targets
 from faults.program import wait_for
 from faults.runtime import running
 from faults.wire import Wire
-from fiber._wire.arena import RETAINED_LIMIT
+from fiber._wire.memory_files import RETAINED_LIMIT
 from patience import PATIENCE
 
 MEGABYTES = [64, *(pytest.param(size, marks=pytest.mark.long) for size in (256, 2048, 4100))]

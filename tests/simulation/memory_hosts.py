@@ -20,7 +20,7 @@ from fiber._hub.protocol import NO_SECRET, Extent, ObjectKind, Origin
 from fiber._hub.registry import Registry
 from fiber._hub.replicas import MemoryLink, Replicas
 from fiber._wire import messages
-from fiber._wire.messages import Memory
+from fiber._wire.messages import MemoryMessage
 
 MASTER = "master"
 RACY = 24
@@ -51,7 +51,7 @@ class Host:
         self.registry = Registry(lambda shared: HostedMemory(), _at_once)
         self.replicas = Replicas(name, self.registry)
         self.links: dict[str, MemoryLink] = {}
-        self.wires: dict[str, deque[Memory | Passing]] = {}
+        self.wires: dict[str, deque[MemoryMessage | Passing]] = {}
 
     def connect(self, other: Host, *, dialer: bool) -> None:
         """This side of a link."""
@@ -69,13 +69,13 @@ class Host:
         self.links[hop].flush()
         self.wires[hop].append(message)
 
-    def receive(self, sender: str, frame: Memory | Passing) -> None:
+    def receive(self, sender: str, frame: MemoryMessage | Passing) -> None:
         """The next frame of a link."""
         if isinstance(frame, Passing):
             self.send(frame)
             return
         again = messages.decode(bytearray(frame.encode()))
-        assert isinstance(again, Memory)
+        assert isinstance(again, MemoryMessage)
         self.links[sender].on_frame(again)
 
 

@@ -13,7 +13,7 @@ from fiber._agent.interface import ExitReport
 from fiber._transport.link import LinkObserver
 from fiber._transport.stream import Lane
 from fiber._wire import messages, packet
-from fiber._wire.messages import BytesLike
+from fiber._wire.memory_files import BytesLike
 from patience import PATIENCE
 
 
@@ -131,7 +131,7 @@ class ReadLink:
     """A link whose frames leave at once, and are kept for the test to read."""
 
     def __init__(self) -> None:
-        self.sent: list[messages.Message] = []
+        self.sent: list[messages.LinkMessage] = []
 
     def attach(self, observer: LinkObserver) -> None:
         pass

@@ -10,7 +10,7 @@ from fiber._agent import program_folder
 from fiber._backends.program_files import Entry, select
 from fiber._backends.program_layout import Layout, Places
 from fiber._backends.shipping import pack
-from fiber._wire.blob import Blob
+from fiber._wire.memory_files import Blob
 
 NOWHERE = program_folder.ProgramPaths((), (), "", None)
 

@@ -15,8 +15,8 @@ from fiber._agent.interface import Cause
 from fiber._agent.program_folder import ProgramPaths
 from fiber._hub.hub import Hub
 from fiber._transport.loop import Loop
-from fiber._wire.blob import Blob
 from fiber._wire.descriptor import contents
+from fiber._wire.memory_files import Blob
 from patience import PATIENCE
 from unit.shipping_site import packed, write
 from unit.test_agent import begin, end, settled

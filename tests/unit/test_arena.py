@@ -13,20 +13,20 @@ from collections.abc import Iterator
 import pytest
 
 from census import wait_until
-from fiber._wire import arena
-from fiber._wire.arena import (
+from fiber._wire import memory_files
+from fiber._wire.descriptor import opened, own
+from fiber._wire.memory_files import (
+    BORROWED_BLOCKS,
     DATA_OFFSET,
-    LENT_BLOCKS,
     RETAINED_BLOCKS,
     RETAINED_LIMIT,
     Arena,
-    Block,
+    MessageBlock,
     fill,
     in_place,
     mapping,
     release,
 )
-from fiber._wire.descriptor import opened, own
 from patience import PATIENCE
 
 
@@ -75,7 +75,7 @@ def test_a_block_read_in_place_is_its_senders_again_once_nobody_looks_at_it(bloc
 
 def test_only_so_many_blocks_are_read_in_place(blocks: Arena) -> None:
     block = blocks.claim(1000)
-    read = [read_in_place(block.fd, 1000) for _ in range(LENT_BLOCKS)]
+    read = [read_in_place(block.fd, 1000) for _ in range(BORROWED_BLOCKS)]
     assert all(memory is not None for memory in read)
     assert read_in_place(block.fd, 1000) is None
     read.pop()
@@ -95,8 +95,8 @@ def test_where_no_descriptor_is_left_a_block_is_copied(
 
     block = blocks.claim(1000)
     with monkeypatch.context() as full:
-        full.setattr(arena, "_Lent", refuse)
-        for _ in range(LENT_BLOCKS + 1):
+        full.setattr(memory_files, "_BorrowedBlock", refuse)
+        for _ in range(BORROWED_BLOCKS + 1):
             assert read_in_place(block.fd, 1000) is None
     assert read_in_place(block.fd, 1000) is not None, "none of those counts as read"
     blocks.settle(block, sent=False)
@@ -191,7 +191,7 @@ def test_the_parts_lie_where_they_were_put(blocks: Arena) -> None:
     fill(block, [memoryview(b"one"), memoryview(b"two")], [DATA_OFFSET, DATA_OFFSET + 100])
     assert os.pread(block.fd, 3, DATA_OFFSET) == b"one"
     assert os.pread(block.fd, 3, DATA_OFFSET + 100) == b"two"
-    assert block.flag[0] == arena._BUSY
+    assert block.flag[0] == memory_files._BUSY
     blocks.settle(block, sent=False)
 
 
@@ -201,14 +201,14 @@ def test_a_block_without_memory_leaves_no_descriptor(monkeypatch: pytest.MonkeyP
 
     before = os.listdir("/proc/self/fd")
     with monkeypatch.context() as short:
-        short.setattr(arena.mmap, "mmap", refuse)
+        short.setattr(memory_files.mmap, "mmap", refuse)
         with pytest.raises(OSError, match="no memory"):
-            Block(1 << 16)
+            MessageBlock(1 << 16)
     assert os.listdir("/proc/self/fd") == before
 
 
 def test_much_memory_is_given_back_by_a_thread(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(arena, "SLOWLY", 1 << 16)
+    monkeypatch.setattr(memory_files, "SLOWLY", 1 << 16)
     owner = opened(os.memfd_create, "message")
     os.ftruncate(owner.fileno(), 1 << 16)
     part = memoryview(mapping(owner, 1 << 16))[10:20]
@@ -228,7 +228,7 @@ def test_where_no_thread_can_be_started_memory_is_given_back_at_once(
     def refuse(_thread: threading.Thread) -> None:
         raise RuntimeError("can't start new thread")
 
-    monkeypatch.setattr(arena, "SLOWLY", 1 << 16)
+    monkeypatch.setattr(memory_files, "SLOWLY", 1 << 16)
     monkeypatch.setattr(threading.Thread, "start", refuse)
     owner = opened(os.memfd_create, "message")
     os.ftruncate(owner.fileno(), 1 << 16)
@@ -238,13 +238,13 @@ def test_where_no_thread_can_be_started_memory_is_given_back_at_once(
 
 KEPT_TO_THE_END = """
 import os
-from fiber._wire import arena
+from fiber._wire import memory_files
 from fiber._wire.descriptor import opened
 
-arena.SLOWLY = 1 << 16
+memory_files.SLOWLY = 1 << 16
 owner = opened(os.memfd_create, "message")
 os.ftruncate(owner.fileno(), 1 << 16)
-kept = arena.mapping(owner, 1 << 16)
+kept = memory_files.mapping(owner, 1 << 16)
 """
 
 

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from fiber._wire import assembly, packet
-from fiber._wire.assembly import IN_FILE, Assembly, pass_on
+from fiber._wire import memory_files, packet
+from fiber._wire.memory_files import IN_FILE, Assembly, pass_on
 from fiber._wire.messages import Deliver, FromChild, TunnelData, decode, is_passed_on
 from fiber._wire.packet import INLINE_LIMIT
 
@@ -92,7 +92,7 @@ def test_a_process_that_may_write_no_file_keeps_a_frame_in_its_own_memory(pair: 
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     (buffer,) = views(message)
-    assert assembly.place_of(buffer) is None
+    assert memory_files.place_of(buffer) is None
     pass_on(buffer)
     packet.send(one, b"payload", [buffer])
     assert packet.receive(other).buffers == [buffer]

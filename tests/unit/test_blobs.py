@@ -20,8 +20,8 @@ from fiber._backends.remote import BlobSender
 from fiber._runtime import state
 from fiber._runtime.state import SharedArguments
 from fiber._wire import messages
-from fiber._wire.blob import Blob
 from fiber._wire.descriptor import contents
+from fiber._wire.memory_files import Blob
 from memory_link import SimulatedLoop
 from patience import PATIENCE
 from unit.test_loopback import running
@@ -40,7 +40,9 @@ class Sent:
         """Callers whose blobs have left."""
         self.parcels = BlobSender(self.loop, self.send)  # type: ignore[arg-type]
 
-    def send(self, message: messages.Message, on_left: Callable[[], None] | None = None) -> None:
+    def send(
+        self, message: messages.LinkMessage, on_left: Callable[[], None] | None = None
+    ) -> None:
         self.messages.append(message)
         self.leaving.append(on_left)
 
@@ -69,11 +71,11 @@ def test_a_blob_is_sent_once_and_forgotten_with_its_last_holder() -> None:
     sent.need(one, other)
     sent.need(other, one)
     known, gone = name(one), name(other)
-    assert sent.kinds() == [f"Blob {known}", f"Blob {gone}"]
+    assert sent.kinds() == [f"KeepBlob {known}", f"KeepBlob {gone}"]
     del other
     assert sent.kinds() == [f"Forget {gone}"]
     sent.need(one, Blob(b"other"))
-    assert sent.kinds()[0] == f"Blob {gone}"
+    assert sent.kinds()[0] == f"KeepBlob {gone}"
 
 
 def test_the_same_content_made_anew_in_time_is_not_sent_again() -> None:
@@ -82,7 +84,7 @@ def test_the_same_content_made_anew_in_time_is_not_sent_again() -> None:
     del first  # the loop is told and has not looked yet
     second = Blob(b"content")
     sent.need(second)
-    assert sent.kinds() == [f"Blob {name(second)}"]
+    assert sent.kinds() == [f"KeepBlob {name(second)}"]
     del second
     assert len(sent.kinds()) == 1
 
@@ -92,14 +94,15 @@ def test_what_an_agent_could_not_keep_is_sent_again() -> None:
     sent.need(blob)
     sent.parcels.lost(blob.digest)
     sent.need(blob)
-    assert sent.kinds() == [f"Blob {name(blob)}"] * 2
+    assert sent.kinds() == [f"KeepBlob {name(blob)}"] * 2
 
 
 def test_no_agent_costs_a_copy_of_the_content() -> None:
     content = b"content"
     blob = Blob(content)
-    assert messages.decode(blob.message.encode()) == blob.message
-    assert messages.pieces(blob.message)[-1] is content
+    message = messages.KeepBlob(blob.digest, blob.data)
+    assert messages.decode(message.encode()) == message
+    assert messages.pieces(message)[-1] is content
     assert bytes(contents(blob.fileno())) == content
 
 
@@ -133,7 +136,7 @@ def test_a_store_keeps_what_it_is_sent_until_it_is_told_to_forget(
     data: bytes, tmp_path: Any
 ) -> None:
     store, digest = BlobStore(str(tmp_path)), Blob(data).digest
-    store.put(messages.Blob(digest, data))
+    store.put(messages.KeepBlob(digest, data))
     held = store.get(digest)
     store.forget(digest)
     with pytest.raises(BlobLacking, match="it was forgotten"):
@@ -148,7 +151,7 @@ def test_a_store_without_room_says_so_once_and_keeps_the_next(
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    store, message = BlobStore(str(tmp_path)), messages.Blob(Blob(b"x").digest, b"x")
+    store, message = BlobStore(str(tmp_path)), messages.KeepBlob(Blob(b"x").digest, b"x")
     monkeypatch.setattr(service.Blob, "in_file", full)
     store.put(message)
     with pytest.raises(BlobLacking, match="No space left on device") as caught:

@@ -33,8 +33,8 @@ from fiber._runtime import state
 from fiber._sync import semaphore as shared_semaphore
 from fiber._transport import unix
 from fiber._transport.loop import Wakeup
-from fiber._wire import arena, descriptor, packet
-from fiber._wire.arena import Arena, Block
+from fiber._wire import descriptor, memory_files, packet
+from fiber._wire.memory_files import Arena, MessageBlock
 from fiber.connection import Connection, wait
 from fiber.results import IMapIterator
 from hosts import Hosts, objects_kept
@@ -421,7 +421,7 @@ MAKERS: dict[str, Callable[[], Any]] = {
     "SimpleQueue": fiber.SimpleQueue,
     "Queue": lambda: fiber.Queue().put(1),
     "bounded Queue": lambda: fiber.Queue(1),
-    "memory for a large message": lambda: Block(1 << 16),
+    "memory for a large message": lambda: MessageBlock(1 << 16),
 }
 
 
@@ -494,7 +494,7 @@ def test_whatever_interrupts_a_start_no_descriptor_that_it_passes_is_left(
 def test_whatever_interrupts_a_large_message_none_is_damaged_and_no_descriptor_left(
     side: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    files = {packet.__file__, arena.__file__, descriptor.__file__}
+    files = {packet.__file__, memory_files.__file__, descriptor.__file__}
     first, second = b"1" * packet.INLINE_LIMIT * 2, b"2" * packet.INLINE_LIMIT * 2
     before = os.listdir("/proc/self/fd")
 
@@ -535,9 +535,9 @@ def test_whatever_interrupts_a_large_message_none_is_damaged_and_no_descriptor_l
 
 def test_a_large_message_within_a_large_message() -> None:
     arena = Arena()
-    blocks: list[Block] = []
+    blocks: list[MessageBlock] = []
 
-    class Interrupting(Block):
+    class Interrupting(MessageBlock):
         @property
         def capacity(self) -> int:  # type: ignore[override]
             if not blocks:

@@ -13,15 +13,15 @@ from fiber._agent.interface import Cause
 from fiber._wire.messages import (
     DIGEST_BYTES,
     PROTOCOL,
-    Blob,
+    ChildOutput,
     Deliver,
     Exited,
     Forget,
     FromChild,
+    KeepBlob,
     Lacking,
     Leave,
-    Message,
-    Output,
+    LinkMessage,
     ProtocolError,
     Recall,
     Recalled,
@@ -46,9 +46,9 @@ any_text = st.text(st.characters(), max_size=50)
 
 digests = st.binary(min_size=DIGEST_BYTES, max_size=DIGEST_BYTES)
 
-messages: st.SearchStrategy[Message] = st.one_of(
+messages: st.SearchStrategy[LinkMessage] = st.one_of(
     st.builds(Start, ids, data, data),
-    st.builds(Blob, digests, data),
+    st.builds(KeepBlob, digests, data),
     st.builds(Forget, digests),
     st.builds(Leave, st.floats(allow_nan=False), any_text),
     st.builds(Lacking, digests),
@@ -70,7 +70,7 @@ messages: st.SearchStrategy[Message] = st.one_of(
         any_text,
         st.sampled_from(Cause),
     ),
-    st.builds(Output, ids, any_text),
+    st.builds(ChildOutput, ids, any_text),
     st.builds(TunnelOpen, ids, any_text),
     st.builds(TunnelData, ids, data, buffers),
     st.builds(TunnelClose, ids, any_text),
@@ -79,13 +79,13 @@ messages: st.SearchStrategy[Message] = st.one_of(
 
 
 @given(messages)
-def test_there_and_back(message: Message) -> None:
+def test_there_and_back(message: LinkMessage) -> None:
     assert decode(message.encode()) == message
 
 
 @given(messages, st.data())
 def test_a_damaged_frame_raises_nothing_but_protocol_error(
-    message: Message, draw: st.DataObject
+    message: LinkMessage, draw: st.DataObject
 ) -> None:
     frame = bytearray(message.encode())
     for _ in range(draw.draw(st.integers(0, 3))):
@@ -115,11 +115,14 @@ def test_noise_of_any_kind_raises_nothing_but_protocol_error(kind: int, noise: b
         (Signal(1, 15).encode()[:-1], "of kind signal and 17 bytes is malformed"),
         (Recall(1).encode() + b"!", "of kind recall and 11 bytes is malformed"),
         (Forget(bytes(DIGEST_BYTES)).encode()[:-1], "of kind forget and 33 bytes is malformed"),
-        (Blob(bytes(DIGEST_BYTES), b"").encode()[:-1], "of kind blob and 33 bytes is malformed"),
+        (
+            KeepBlob(bytes(DIGEST_BYTES), b"").encode()[:-1],
+            "of kind blob and 33 bytes is malformed",
+        ),
         (Recalled(1, (5,)).encode()[:-1], "sequence numbers is cut short"),
         (FromChild(1, b"", [b"12"]).encode()[:-1], "a packet that ends after 66 bytes"),
         (bytes([PROTOCOL, 5]) + bytes(8) + b"\xff\xff\xff\xff" + bytes(8), "4294967295 buffers"),
-        (Output(1, "x").encode() + b"\xff", "of kind output .* is malformed"),
+        (ChildOutput(1, "x").encode() + b"\xff", "of kind output .* is malformed"),
         (Exited(1, 0, 0, "").encode()[:-1], "of kind exited .* is malformed"),
         (
             Recall(1).encode()[:1] + b"\x08" + bytes(8) + b'[0, "0", "", [], null, [], "", 0, ""]',
@@ -175,8 +178,8 @@ def test_buffers_of_any_item_size_are_taken_by_their_bytes() -> None:
     [
         (Start(3, SECRET.encode(), b"1"), "Start(child=3, spec=<14 bytes>, process=<1 bytes>)"),
         (
-            Blob(bytes(DIGEST_BYTES), SECRET.encode()),
-            "Blob(digest=<32 bytes>, data=<14 bytes>)",
+            KeepBlob(bytes(DIGEST_BYTES), SECRET.encode()),
+            "KeepBlob(digest=<32 bytes>, data=<14 bytes>)",
         ),
         (
             Deliver(3, 4, SECRET.encode(), [SECRET.encode()]),
@@ -186,7 +189,7 @@ def test_buffers_of_any_item_size_are_taken_by_their_bytes() -> None:
             FromChild(3, memoryview(SECRET.encode())),
             "FromChild(child=3, payload=<14 bytes>, buffers=())",
         ),
-        (Output(3, SECRET), "Output(child=3, text=<14 characters>)"),
+        (ChildOutput(3, SECRET), "ChildOutput(child=3, text=<14 characters>)"),
         (
             Exited(3, 2, -9, SECRET, (1, 2), (1, 0), (SECRET,), SECRET, 0, SECRET),
             "Exited(child=3, delivered=2, exitcode=-9, reason=<14 characters>, "
@@ -200,13 +203,13 @@ def test_buffers_of_any_item_size_are_taken_by_their_bytes() -> None:
         (Signal(3, 15), "Signal(child=3, signum=15)"),
     ],
 )
-def test_a_repr_shows_no_data_of_the_user(message: Message, shown: str) -> None:
+def test_a_repr_shows_no_data_of_the_user(message: LinkMessage, shown: str) -> None:
     assert repr(message) == shown
     assert str(message) == shown
 
 
 def test_only_messages_about_the_same_child_or_blob_wait_for_a_large_one() -> None:
-    start, blob = Start(1, b"", b""), Blob(bytes(DIGEST_BYTES), b"")
+    start, blob = Start(1, b"", b""), KeepBlob(bytes(DIGEST_BYTES), b"")
     assert lane(start) == lane(Deliver(1, 2, b"")) == lane(Recall(1))
     assert lane(blob) == lane(Forget(blob.digest))
     lanes = [lane(start), lane(blob), lane(Start(2, b"", b"")), lane(TunnelData(1, b""))]

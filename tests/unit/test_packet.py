@@ -16,9 +16,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fiber._wire import arena, packet, raw_memory
-from fiber._wire.arena import RETAINED_LIMIT
+from fiber._wire import memory_files, packet
 from fiber._wire.descriptor import opened
+from fiber._wire.memory_files import RETAINED_LIMIT
 from fiber._wire.packet import BULK, INLINE_LIMIT
 from fiber.errors import TooManyOpenFiles
 from patience import PATIENCE
@@ -138,7 +138,7 @@ def test_a_message_is_released_whatever_unpickling_does(pair: Pair) -> None:
     message = packet.receive(other)
     with pytest.raises(pickle.UnpicklingError):
         packet.loads(message)
-    assert message._lent is None
+    assert message._buffer is None
 
 
 def test_too_many_buffers_are_refused(pair: Pair) -> None:
@@ -316,7 +316,7 @@ def test_what_its_owner_may_change_is_kept_by_a_copy() -> None:
 @pytest.mark.parametrize("size", [0, 1, packet.OUT_OF_BAND_MIN, 5_000_000])
 def test_a_copy_that_other_threads_can_run_beside_is_one(size: int) -> None:
     source = bytearray(os.urandom(size))
-    made = raw_memory.copy(memoryview(source).toreadonly())
+    made = memory_files.copy_bytes(memoryview(source).toreadonly())
     assert type(made) is bytes
     assert made == source
     assert hash(made) == hash(bytes(source))
@@ -326,10 +326,10 @@ def test_a_copy_of_a_mapped_message_is_read_from_its_file(monkeypatch: pytest.Mo
     size = 33 << 20
     file = opened(os.memfd_create, "message")
     os.pwrite(file.fileno(), b"header" + os.urandom(size), 0)
-    mapped = arena.mapping(file, 6 + size)
+    mapped = memory_files.mapping(file, 6 + size)
     expected = bytes(mapped[6:])
-    monkeypatch.setattr(raw_memory.ctypes, "memmove", None)  # it would fault at every page
-    assert raw_memory.copy(memoryview(mapped)[6:]) == expected
+    monkeypatch.setattr(memory_files.ctypes, "memmove", None)  # it would fault at every page
+    assert memory_files.copy_bytes(memoryview(mapped)[6:]) == expected
     os.ftruncate(file.fileno(), size)
     with pytest.raises(ValueError, match=f"ends after {size - 6} of {size} bytes"):
-        raw_memory.copy(memoryview(mapped)[6:])
+        memory_files.copy_bytes(memoryview(mapped)[6:])

@@ -13,7 +13,7 @@ from fiber._agent.interface import ChildSpec
 from fiber._backends.remote import RemoteAgent, RemoteChild
 from fiber._transport.stream import Lane
 from fiber._wire import messages
-from fiber._wire.messages import BytesLike
+from fiber._wire.memory_files import BytesLike
 from memory_link import SimulatedLoop
 from unit.agent_children import ReadLink, Recorder
 
@@ -35,12 +35,12 @@ def agent_with_children(host: str, count: int) -> tuple[RemoteAgent, list[Record
         messages.Started(2, 1),
         messages.FromChild(2, b"forged"),
         messages.Recalled(2, (1, 2)),
-        messages.Output(2, "forged"),
+        messages.ChildOutput(2, "forged"),
         messages.Exited(2, 0, -9, "forged"),
     ],
     ids=lambda message: type(message).__name__,
 )
-def test_an_agent_speaks_for_no_child_of_another(message: messages.Message) -> None:
+def test_an_agent_speaks_for_no_child_of_another(message: messages.LinkMessage) -> None:
     _, (_, other) = agent_with_children("victim", 2)
     before = dict(vars(other))
     liar, (own,) = agent_with_children("liar", 1)

@@ -15,7 +15,7 @@ from fiber._hub.client import Unreachable
 from fiber._hub.heap import Block
 from fiber._hub.protocol import NO_SECRET, Origin
 from fiber._hub.replicas import Replicas
-from fiber._wire.messages import Memory, ProtocolError
+from fiber._wire.messages import MemoryMessage, ProtocolError
 from hosts import Far, Hosts, Wire, objects_kept
 from patience import PATIENCE
 
@@ -234,4 +234,4 @@ def buffer_of_handle(block: Block) -> Any:
 def test_malformed_frames_end_the_link(replicas: Replicas, payload: bytes) -> None:
     link = replicas.link("x", lambda frame: None, dialer=True)
     with pytest.raises(ProtocolError, match="malformed"):
-        link.on_frame(Memory(1, payload))
+        link.on_frame(MemoryMessage(1, payload))

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from fiber._transport.stream import SLOTS, Lane, ResumableStream, Turns
-from fiber._wire import assembly
+from fiber._wire import memory_files
 
 BUDGET = 64
 LARGE = 10 * BUDGET
@@ -158,7 +158,7 @@ def test_a_stream_that_ends_forgets_what_has_arrived_of_a_frame(
 def test_whatever_is_sent_arrives_in_the_order_that_is_promised(
     seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(assembly, "IN_FILE", 3 * BUDGET)
+    monkeypatch.setattr(memory_files, "IN_FILE", 3 * BUDGET)
     rng = random.Random(seed)
     sender, receiver = (ResumableStream(0, budget=BUDGET) for _ in range(2))
     sender.connected(0)

@@ -28,7 +28,7 @@ from fiber._hub import client as hub_client
 from fiber._hub.hub import Hub
 from fiber._hub.protocol import HubAddress
 from fiber._transport.loop import Loop
-from fiber._wire.blob import Blob
+from fiber._wire.memory_files import Blob
 
 _ENDING = "this process is ending: no process can be started any more"
 

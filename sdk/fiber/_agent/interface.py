@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import NamedTuple, Protocol
 
-from fiber._wire.blob import Blob
 from fiber._wire.descriptor import Descriptor
-from fiber._wire.packet import BytesLike, Message
+from fiber._wire.memory_files import Blob, BytesLike
+from fiber._wire.packet import Message
 from fiber.resources import Resources
 
 UNKNOWN = 255

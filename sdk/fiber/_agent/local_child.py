@@ -31,8 +31,8 @@ from fiber._hub.protocol import HubAddress
 from fiber._transport.loop import Loop
 from fiber._transport.unix import Outbox, naming_the_limit, socketpair
 from fiber._wire import packet
-from fiber._wire.blob import Blob
-from fiber._wire.packet import BytesLike, Message
+from fiber._wire.memory_files import Blob, BytesLike
+from fiber._wire.packet import Message
 from fiber.errors import TooManyOpenFiles
 
 _SEQ = struct.Struct("<Q")

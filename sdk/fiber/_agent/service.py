@@ -27,10 +27,8 @@ from fiber._transport.loop import Loop
 from fiber._transport.stream import Frame
 from fiber._transport.unix import naming_the_limit
 from fiber._wire import messages, packet
-from fiber._wire.assembly import pass_on, place_of
-from fiber._wire.blob import Blob
 from fiber._wire.descriptor import contents
-from fiber._wire.packet import BytesLike
+from fiber._wire.memory_files import Blob, BytesLike, pass_on, place_of
 
 _KNOWN_HERE = ExitReport._fields.index("pod")
 """Fields of an exit report that an agent knows; the master adds the others."""
@@ -64,13 +62,15 @@ class AgentService:
         self._lost = False
         self._ended = False
 
-    def send(self, message: messages.Message, on_left: Callable[[], None] | None = None) -> None:
+    def send(
+        self, message: messages.LinkMessage, on_left: Callable[[], None] | None = None
+    ) -> None:
         """Send a message to the master; call ``on_left`` once the message has left."""
         self._hub_link.flush()
         self._transmit(message, on_left)
 
     def _transmit(
-        self, message: messages.Message, on_left: Callable[[], None] | None = None
+        self, message: messages.LinkMessage, on_left: Callable[[], None] | None = None
     ) -> None:
         lane = messages.lane(message)
         self._link.send(*messages.pieces(message), lane=lane, on_left=on_left)
@@ -82,13 +82,13 @@ class AgentService:
         message = messages.decode(frame)
         if isinstance(message, messages.Start):
             self._start(message)
-        elif isinstance(message, messages.Blob):
+        elif isinstance(message, messages.KeepBlob):
             self._blobs.put(message)
         elif isinstance(message, messages.Forget):
             self._blobs.forget(message.digest)
         elif isinstance(message, messages.Shutdown):
             self.stop("the master ended", message.grace)
-        elif isinstance(message, messages.OfHubs):
+        elif isinstance(message, messages.HubMessage):
             self._hub_link.on_frame(message)
         elif isinstance(message, messages.Deliver | messages.Signal | messages.Recall):
             child = self._children.get(message.child)
@@ -301,7 +301,7 @@ class _Observed:
         """Send the child's output to the master."""
         self._output += len(text)
         left = partial(self._output_left, len(text))
-        self._service.send(messages.Output(self._number, text), left)
+        self._service.send(messages.ChildOutput(self._number, text), left)
 
     def busy(self) -> bool:
         """Return whether so much output waits for the link that the agent must stop reading it.
@@ -418,7 +418,7 @@ class BlobStore:
         self._refused: dict[bytes, str] = {}
         """Blobs for which the system had no room, and the reasons."""
 
-    def put(self, message: messages.Blob) -> None:
+    def put(self, message: messages.KeepBlob) -> None:
         """Keep a blob.  If the system refuses that, ``get`` raises the reason."""
         try:
             blob = Blob.in_file(message.digest, message.data, self._directory)

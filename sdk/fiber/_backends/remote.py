@@ -23,8 +23,8 @@ from fiber._hub.hub import Hub
 from fiber._transport.link import EventLoop, Link
 from fiber._transport.stream import Frame
 from fiber._wire import messages, packet
-from fiber._wire.blob import Blob
-from fiber._wire.packet import BytesLike, Message
+from fiber._wire.memory_files import Blob, BytesLike
+from fiber._wire.packet import Message
 
 _SHUTDOWN_GRACE = 0.5
 
@@ -114,18 +114,20 @@ class RemoteAgent:
         """None waits here."""
         return False
 
-    def send(self, message: messages.Message) -> None:
+    def send(self, message: messages.LinkMessage) -> None:
         """Send a message.  From anywhere."""
         self.loop.call_soon(self.transmit, message)
 
     def transmit(
-        self, message: messages.Message, on_left: Callable[[], None] | None = None
+        self, message: messages.LinkMessage, on_left: Callable[[], None] | None = None
     ) -> None:
         """Send a message now; ``on_left`` is called once the last of it is on its way."""
         self._hub_link.flush()
         self._put(message, on_left)
 
-    def _put(self, message: messages.Message, on_left: Callable[[], None] | None = None) -> None:
+    def _put(
+        self, message: messages.LinkMessage, on_left: Callable[[], None] | None = None
+    ) -> None:
         lane = messages.lane(message)
         self._link.send(*messages.pieces(message), lane=lane, on_left=on_left)
 
@@ -179,7 +181,7 @@ class RemoteAgent:
     def on_frame(self, frame: Frame) -> None:
         """Take a message of the agent about its children."""
         message = messages.decode(frame)
-        if isinstance(message, messages.OfHubs):
+        if isinstance(message, messages.HubMessage):
             self._hub_link.on_frame(message)
             return
         if isinstance(message, messages.Leave):
@@ -238,7 +240,7 @@ class RemoteChild:
         """Fatal signal that was sent to it before it had begun."""
         self._early: list[tuple[int, BytesLike, Sequence[memoryview]]] = []
         """Packets to deliver after its Start."""
-        self._unasked: list[messages.Message] | None = []
+        self._unasked: list[messages.LinkMessage] | None = []
         """Signals and recalls, which wait until its Start has left: they would pass a large one."""
         self._delivered = 0
         self._latest: deque[int] = deque(maxlen=_REMEMBERED)
@@ -332,7 +334,7 @@ class RemoteChild:
         """Send it a signal."""
         self._loop.call_soon(self._ask, messages.Signal, signum)
 
-    def _ask(self, message: Callable[..., messages.Message], *fields: int) -> None:
+    def _ask(self, message: Callable[..., messages.LinkMessage], *fields: int) -> None:
         if self._gone:
             return
         if self._agent is not None:
@@ -343,13 +345,13 @@ class RemoteChild:
             name = signal.Signals(fields[0]).name
             self.end(ExitReport(-fields[0], f"killed by {name} before it had a host"))
 
-    def _tell(self, message: messages.Message) -> None:
+    def _tell(self, message: messages.LinkMessage) -> None:
         if self._unasked is not None:
             self._unasked.append(message)
         elif self._agent is not None and not self._gone:
             self._agent.transmit(message)
 
-    def heard(self, message: messages.Message, output: Output) -> None:
+    def heard(self, message: messages.LinkMessage, output: Output) -> None:
         """Something about this child."""
         if isinstance(message, messages.FromChild):
             buffers = [memoryview(buffer) for buffer in message.buffers]
@@ -363,7 +365,7 @@ class RemoteChild:
             self.observer.started(message.pid)
         elif isinstance(message, messages.Recalled):
             self.observer.recalled(list(message.seqs))
-        elif isinstance(message, messages.Output):
+        elif isinstance(message, messages.ChildOutput):
             output.write(f"{self.name}@{self.host}", message.text)
         elif isinstance(message, messages.Exited) and self._may_begin_elsewhere(message):
             self._agent, self.host, self._unasked = None, "", []
@@ -399,7 +401,7 @@ class Send(Protocol):
     """Sends a message to the agent; ``on_left`` is called once the last of it is on its way."""
 
     def __call__(
-        self, message: messages.Message, on_left: Callable[[], None] | None = None
+        self, message: messages.LinkMessage, on_left: Callable[[], None] | None = None
     ) -> None: ...
 
 
@@ -430,7 +432,7 @@ class BlobSender:
             needed.append(digest)
             if digest not in self._sent:
                 self._leaving[digest] = self._leaving.get(digest, 0) + 1
-                self._send(blob.message, partial(self._left, digest))
+                self._send(messages.KeepBlob(digest, blob.data), partial(self._left, digest))
             # The newest of several with the same content counts.
             self._sent[digest] = weakref.ref(blob, self._forgetter(digest))
         self._waiting.append((needed, then))

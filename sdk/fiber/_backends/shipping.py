@@ -22,7 +22,7 @@ from fiber._agent.program_folder import ProgramPaths
 from fiber._backends import program_files
 from fiber._backends.program_files import Entry, LeftOut, Why, select
 from fiber._backends.program_layout import INCLUDING, Layout, find_layout, main_file
-from fiber._wire.blob import Blob
+from fiber._wire.memory_files import Blob
 from fiber.errors import ProgramTooLarge, in_one_line
 
 _SHOWN = 10

@@ -20,7 +20,8 @@ from fiber._hub.registry import Registry
 from fiber._transport.unix import naming_the_limit, wait_readable
 from fiber._wire import packet
 from fiber._wire.descriptor import Descriptor
-from fiber._wire.packet import BytesLike, Message
+from fiber._wire.memory_files import BytesLike
+from fiber._wire.packet import Message
 from fiber.errors import ConnectionClosed, FiberError
 
 _FORMS = {form.size: form for form in (HEAD, ONE, SECRETS)}

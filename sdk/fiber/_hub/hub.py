@@ -45,7 +45,7 @@ from fiber._hub.tunnel import Router, Tunnels
 from fiber._transport.loop import DOZE, Loop
 from fiber._transport.unix import naming_the_limit, socketpair
 from fiber._wire.descriptor import Descriptor, own
-from fiber._wire.messages import Memory, OfHubs
+from fiber._wire.messages import HubMessage, MemoryMessage
 from fiber.errors import TooManyOpenFiles
 
 _PEER = struct.Struct("iII")  # pid, uid, gid
@@ -275,7 +275,7 @@ def _problem(error: OSError) -> str:
     )
 
 
-Send = Callable[[OfHubs], None]
+Send = Callable[[HubMessage], None]
 
 
 class HubLink:
@@ -292,9 +292,9 @@ class HubLink:
         self._send = send
         self._waiting: deque[TunnelFrame] = deque()
 
-    def on_frame(self, frame: OfHubs) -> None:
+    def on_frame(self, frame: HubMessage) -> None:
         """A frame of the other side's hub."""
-        if isinstance(frame, Memory):
+        if isinstance(frame, MemoryMessage):
             self.memory.on_frame(frame)
         else:
             self.tunnels.on_frame(frame)

@@ -15,7 +15,8 @@ from fiber._transport.loop import LONGEST_POLL
 from fiber._transport.unix import UnixChannel, UnixCounter, grow
 from fiber._wire import packet
 from fiber._wire.descriptor import Descriptor
-from fiber._wire.packet import BytesLike, Message
+from fiber._wire.memory_files import BytesLike
+from fiber._wire.packet import Message
 
 _Socket = TypeVar("_Socket", bound=socket.socket)
 

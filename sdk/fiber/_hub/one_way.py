@@ -40,7 +40,8 @@ from fiber._sync.robust_mutex import RobustMutex
 from fiber._transport.unix import BorrowedSocket, wait_readable, wait_until
 from fiber._wire import packet
 from fiber._wire.descriptor import Descriptor
-from fiber._wire.packet import BytesLike, Message
+from fiber._wire.memory_files import BytesLike
+from fiber._wire.packet import Message
 from fiber.errors import ConnectionClosed
 
 HEAD, TAIL = 8, 9

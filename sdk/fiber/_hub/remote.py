@@ -32,7 +32,8 @@ from fiber._hub.protocol import (
 from fiber._transport.base import Claimant
 from fiber._transport.unix import wait_readable
 from fiber._wire import packet
-from fiber._wire.packet import BytesLike, Message
+from fiber._wire.memory_files import BytesLike
+from fiber._wire.packet import Message
 from fiber.errors import ConnectionClosed
 
 Taken: TypeAlias = "list[weakref.ref[RemoteObject]]"

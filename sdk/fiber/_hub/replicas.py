@@ -47,7 +47,7 @@ from fiber._hub.heap import Block, block_of
 from fiber._hub.protocol import ObjectKind, Origin
 from fiber._hub.registry import NoSuchObject, Registry
 from fiber._wire.descriptor import own
-from fiber._wire.messages import Memory, ProtocolError
+from fiber._wire.messages import MemoryMessage, ProtocolError
 
 PATCH = 1 << 18
 """Bytes above which a patch is sent in pieces."""
@@ -174,7 +174,7 @@ def _write(memory: bytearray, runs: list[Run] | Iterator[Run]) -> None:
 
 Identity = tuple[str, bytes]
 """Home of a block, and its secret identity there."""
-Send = Callable[[Memory], None]
+Send = Callable[[MemoryMessage], None]
 
 
 class _Kind(IntEnum):
@@ -341,9 +341,9 @@ class MemoryLink:
                 self._say(share.number, _Kind.PATCH, patch)
 
     def _say(self, number: int, kind: _Kind, data: bytes = b"") -> None:
-        self._send(Memory(number, _KINDS[kind] + data))
+        self._send(MemoryMessage(number, _KINDS[kind] + data))
 
-    def on_frame(self, frame: Memory) -> None:
+    def on_frame(self, frame: MemoryMessage) -> None:
         """Take a frame of the other side; ProtocolError if it is wrong."""
         payload = memoryview(frame.payload)
         try:

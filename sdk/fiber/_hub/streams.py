@@ -16,7 +16,8 @@ from typing import Protocol
 from fiber._hub import protocol
 from fiber._transport.loop import Loop
 from fiber._wire import packet
-from fiber._wire.packet import BytesLike, Message
+from fiber._wire.memory_files import BytesLike
+from fiber._wire.packet import Message
 
 CONGESTED = 1 << 20
 """Bytes waiting to be sent above which a stream asks for patience."""

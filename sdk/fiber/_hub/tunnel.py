@@ -22,9 +22,9 @@ from collections.abc import Callable, Sequence
 
 from fiber._hub.streams import Handler, NullHandler, Stream, splice
 from fiber._wire import messages
-from fiber._wire.assembly import pass_on
+from fiber._wire.memory_files import BytesLike, pass_on
 from fiber._wire.messages import TunnelClose, TunnelData, TunnelOpen
-from fiber._wire.packet import BytesLike, Message
+from fiber._wire.packet import Message
 
 WINDOW = 1 << 21
 """Bytes that one tunnel may have under way before another message."""
@@ -179,7 +179,7 @@ class Tunnels:
         self._send(TunnelOpen(stream._number, host))
         return stream
 
-    def on_frame(self, frame: messages.Message) -> None:
+    def on_frame(self, frame: messages.LinkMessage) -> None:
         """A frame that came over the link."""
         if isinstance(frame, TunnelOpen):
             self._arrived(frame.target, self._new(frame.tunnel))

@@ -15,7 +15,8 @@ from typing import Any, TypeAlias
 
 from fiber._engine.tasks import WrongAnswer
 from fiber._wire import work
-from fiber._wire.packet import BytesLike, Message
+from fiber._wire.memory_files import BytesLike
+from fiber._wire.packet import Message
 
 
 class TaskFailure:

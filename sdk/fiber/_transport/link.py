@@ -28,7 +28,8 @@ from fiber._transport.stream import (
     ResumableStream,
     Statistics,
 )
-from fiber._wire.messages import BytesLike, ProtocolError
+from fiber._wire.memory_files import BytesLike
+from fiber._wire.messages import ProtocolError
 
 
 class Keepalive(NamedTuple):

@@ -15,7 +15,8 @@ from typing import NamedTuple
 from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
-from fiber._wire.messages import BytesLike, ProtocolError
+from fiber._wire.memory_files import BytesLike
+from fiber._wire.messages import ProtocolError
 
 SECRET_SIZE = 32
 OVERHEAD = 16

@@ -43,8 +43,8 @@ from collections import deque
 from collections.abc import Callable, Hashable, Sequence
 from typing import NamedTuple, TypeAlias
 
-from fiber._wire.assembly import Assembly
-from fiber._wire.messages import BytesLike, ProtocolError, is_passed_on
+from fiber._wire.memory_files import Assembly, BytesLike
+from fiber._wire.messages import ProtocolError, is_passed_on
 
 SLOTS = 64
 

@@ -19,7 +19,8 @@ from typing import Any, Self
 from fiber._transport.loop import LONGEST_POLL, Loop
 from fiber._wire import packet
 from fiber._wire.descriptor import Descriptor, opened, opened_pair, own
-from fiber._wire.packet import BytesLike, Message
+from fiber._wire.memory_files import BytesLike
+from fiber._wire.packet import Message
 from fiber.errors import FiberError, FileTooLarge, TooManyOpenFiles
 
 

@@ -15,6 +15,7 @@ import struct
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
+from fiber._wire.memory_files import BytesLike
 from fiber._wire.packet import ALIGNMENT, INLINE_LIMIT
 from fiber.errors import FiberError
 
@@ -23,8 +24,6 @@ PROTOCOL = 2
 
 DIGEST_BYTES = 32
 """Length of what names a blob: the SHA-256 of its bytes."""
-
-BytesLike: TypeAlias = bytes | bytearray | memoryview
 
 
 class ProtocolError(FiberError):
@@ -51,7 +50,7 @@ class Start(NamedTuple):
         return _redacted(self)
 
 
-class Blob(NamedTuple):
+class KeepBlob(NamedTuple):
     """Master to agent: keep this; Start frames name it by its digest until a Forget does."""
 
     digest: bytes
@@ -199,7 +198,7 @@ class Exited(NamedTuple):
         return _redacted(self)
 
 
-class Output(NamedTuple):
+class ChildOutput(NamedTuple):
     """Agent to master: text that the child wrote to stdout or stderr."""
 
     child: int
@@ -255,7 +254,7 @@ class TunnelClose(NamedTuple):
         return _NUMBER.pack(PROTOCOL, _TUNNEL_CLOSE, self.tunnel) + _utf8(self.reason)
 
 
-class Memory(NamedTuple):
+class MemoryMessage(NamedTuple):
     """Either way: about a block of shared memory that both hosts have."""
 
     block: int
@@ -293,9 +292,9 @@ class Leave(NamedTuple):
         return _GRACE.pack(PROTOCOL, _LEAVE, self.grace) + _utf8(self.reason)
 
 
-Message: TypeAlias = (
+LinkMessage: TypeAlias = (
     Start
-    | Blob
+    | KeepBlob
     | Forget
     | Lacking
     | Started
@@ -305,21 +304,21 @@ Message: TypeAlias = (
     | Recall
     | Recalled
     | Exited
-    | Output
+    | ChildOutput
     | TunnelOpen
     | TunnelData
     | TunnelClose
-    | Memory
+    | MemoryMessage
     | Shutdown
     | Leave
 )
 
 
-OfHubs: TypeAlias = TunnelOpen | TunnelData | TunnelClose | Memory
+HubMessage: TypeAlias = TunnelOpen | TunnelData | TunnelClose | MemoryMessage
 """Messages between the hubs of both sides."""
 
 
-def decode(frame: BytesLike) -> Message:
+def decode(frame: BytesLike) -> LinkMessage:
     """Read a frame; ProtocolError says what is wrong with one that cannot be read.
 
     Payloads and buffers are views of ``frame``: not copied, and writable if it is a bytearray.
@@ -357,14 +356,14 @@ _BLOB_HEAD = struct.Struct(f"<BB{DIGEST_BYTES}s")
 _PACKET = struct.Struct("<IQ")
 
 
-def pieces(message: Message) -> Sequence[BytesLike]:
+def pieces(message: LinkMessage) -> Sequence[BytesLike]:
     """A message's frame, in pieces if it has large ones: these are not copied."""
-    if isinstance(message, Start | Blob | Deliver | FromChild | TunnelData):
+    if isinstance(message, Start | KeepBlob | Deliver | FromChild | TunnelData):
         return message.pieces()
     return (message.encode(),)
 
 
-def lane(message: Message) -> Hashable:
+def lane(message: LinkMessage) -> Hashable:
     """The lane that the message travels in.
 
     Messages about one child's start and tasks keep their order, and so do those about one blob and
@@ -372,9 +371,9 @@ def lane(message: Message) -> Hashable:
     """
     if isinstance(message, TunnelData | TunnelClose):
         return (_TUNNEL_DATA, message.tunnel)
-    if isinstance(message, Start | Deliver | FromChild | Recall | Recalled | Exited | Output):
+    if isinstance(message, Start | Deliver | FromChild | Recall | Recalled | Exited | ChildOutput):
         return (_DELIVER, message.child)
-    if isinstance(message, Blob | Forget):
+    if isinstance(message, KeepBlob | Forget):
         return (_BLOB, message.digest)
     return None
 
@@ -444,8 +443,8 @@ def _read_start(view: memoryview) -> Start:
     return Start(_NUMBER.unpack_from(view)[2], spec, process)
 
 
-def _read_blob(view: memoryview) -> Blob:
-    return Blob(_BLOB_HEAD.unpack_from(view)[2], view[_BLOB_HEAD.size :])
+def _read_blob(view: memoryview) -> KeepBlob:
+    return KeepBlob(_BLOB_HEAD.unpack_from(view)[2], view[_BLOB_HEAD.size :])
 
 
 def _read_forget(view: memoryview) -> Forget:
@@ -509,8 +508,8 @@ def _read_exited(view: memoryview) -> Exited:
     )
 
 
-def _read_output(view: memoryview) -> Output:
-    return Output(_NUMBER.unpack_from(view)[2], _text(view[_NUMBER.size :]))
+def _read_output(view: memoryview) -> ChildOutput:
+    return ChildOutput(_NUMBER.unpack_from(view)[2], _text(view[_NUMBER.size :]))
 
 
 def _read_tunnel_open(view: memoryview) -> TunnelOpen:
@@ -525,8 +524,8 @@ def _read_tunnel_close(view: memoryview) -> TunnelClose:
     return TunnelClose(_NUMBER.unpack_from(view)[2], _text(view[_NUMBER.size :]))
 
 
-def _read_memory(view: memoryview) -> Memory:
-    return Memory(_NUMBER.unpack_from(view)[2], view[_NUMBER.size :])
+def _read_memory(view: memoryview) -> MemoryMessage:
+    return MemoryMessage(_NUMBER.unpack_from(view)[2], view[_NUMBER.size :])
 
 
 def _read_shutdown(view: memoryview) -> Shutdown:
@@ -549,7 +548,7 @@ def _string(value: Any) -> str:
     return value
 
 
-_READERS: dict[int, Callable[[memoryview], Message]] = {
+_READERS: dict[int, Callable[[memoryview], LinkMessage]] = {
     _START: _read_start,
     _BLOB: _read_blob,
     _FORGET: _read_forget,

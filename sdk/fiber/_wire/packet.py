@@ -31,20 +31,20 @@ from itertools import starmap
 from operator import is_not
 from typing import Any, TypeAlias
 
-from fiber._wire.arena import (
+from fiber._wire.descriptor import Descriptor, own
+from fiber._wire.memory_files import (
     DATA_OFFSET,
     RETAINED_LIMIT,
     Arena,
+    BytesLike,
+    copy_bytes,
     fill,
     in_place,
     mapping,
+    place_of,
     release,
 )
-from fiber._wire.assembly import place_of
-from fiber._wire.descriptor import Descriptor, own
 from fiber.errors import ConnectionClosed, FileTooLarge, TooManyOpenFiles
-
-BytesLike: TypeAlias = bytes | bytearray | memoryview
 
 INLINE_LIMIT = 1 << 16
 """Bytes of payload and buffers up to which a packet carries them itself."""
@@ -93,7 +93,7 @@ _Received: TypeAlias = list[Any]
 """Result of ``recvmsg_into``; then, of a large message, the owner of its memory."""
 
 
-class _Buffer:
+class _ReceiveBuffer:
     """Memory to receive into, and the arguments of ``recvmsg_into`` for it."""
 
     __slots__ = ("call", "data", "view")
@@ -120,7 +120,7 @@ class _FreeBuffers(threading.local):
     """Receive buffers of this thread that no message is using."""
 
     def __init__(self) -> None:
-        self.free: list[_Buffer] = []
+        self.free: list[_ReceiveBuffer] = []
 
 
 _buffers = _FreeBuffers()
@@ -133,25 +133,25 @@ class Message:
     ``payload`` of a small one is borrowed: call ``release`` (or ``loads``) soon.
     """
 
-    __slots__ = ("_lent", "buffers", "fds", "payload")
+    __slots__ = ("_buffer", "buffers", "fds", "payload")
 
     def __init__(
         self,
         payload: memoryview,
         buffers: list[memoryview],
         fds: list[int],
-        lent: _Buffer | None = None,
+        buffer: _ReceiveBuffer | None = None,
     ) -> None:
         self.payload = payload
         self.buffers = buffers
         self.fds = fds
-        self._lent = lent
+        self._buffer = buffer
 
     def release(self) -> None:
         """Give the borrowed memory back to this thread; the payload must not be used after it."""
-        lent, self._lent = self._lent, None  # first: interrupted, it must not be given back twice
-        if lent is not None:
-            _buffers.free.append(lent)
+        buffer, self._buffer = self._buffer, None  # first: a signal must not give it back twice
+        if buffer is not None:
+            _buffers.free.append(buffer)
 
     def tobytes(self) -> bytes:
         """Copy the payload out and release the message."""
@@ -204,9 +204,7 @@ def large_bytes(buffer: BytesLike) -> bytes:
     """Return the bytes for which a ``_Large`` stood."""
     if isinstance(buffer, bytes):  # they were pickled after all
         return buffer
-    from fiber._wire.raw_memory import copy  # few processes need it
-
-    return copy(memoryview(buffer))
+    return copy_bytes(memoryview(buffer))
 
 
 def _light(obj: Any, known: dict[int, _Large], depth: int = 2) -> Any:
@@ -385,7 +383,7 @@ def receive_object(sock: socket.socket) -> Any:
     NothingYet on a socket whose receivers wait for a limited time.
     """
     free = _buffers.free
-    buffer = free.pop() if free else _Buffer()
+    buffer = free.pop() if free else _ReceiveBuffer()
     ours = True
     try:
         try:
@@ -420,7 +418,7 @@ def receive(
     """
     space = _ANCILLARY if descriptors else _ANCILLARY_ONE
     free = _buffers.free
-    buffer = free.pop() if free else _Buffer()
+    buffer = free.pop() if free else _ReceiveBuffer()
     try:
         call = (((buffer.data,), space, _CLOEXEC if wait else _DONTWAIT),)
         received = _recvmsg(sock, buffer.data, call, then)
@@ -481,10 +479,12 @@ def _rights(ancillary: _Ancillary) -> list[int]:
     ]
 
 
-def _receive_parts(buffer: _Buffer, received: _Received, *, passing: bool = False) -> Message:
+def _receive_parts(
+    buffer: _ReceiveBuffer, received: _Received, *, passing: bool = False
+) -> Message:
     (size, ancillary, flags, _), *memory = received
     view = buffer.view
-    lent = Message(view[:0], [], _rights(ancillary)[len(memory) :], buffer)
+    message = Message(view[:0], [], _rights(ancillary)[len(memory) :], buffer)
     try:
         if not size:
             raise ConnectionClosed()
@@ -497,30 +497,32 @@ def _receive_parts(buffer: _Buffer, received: _Received, *, passing: bool = Fals
         offset = _PARTS.size + _SIZE.size * count
         sizes = [length, *(n for (n,) in _SIZE.iter_unpack(view[_PARTS.size : offset]))]
         if kind == PARTS:
-            return _inline_parts(view[offset:size], sizes, lent)
+            return _inline_parts(view[offset:size], sizes, message)
         if not memory:
             raise ValueError("a large message without its memory")
         if kind == PASSED:
-            return _passed_parts(view[offset:size], sizes, lent, memory[0])
-        return _memory_parts(sizes, lent, memory[0], passing=passing)
+            return _passed_parts(view[offset:size], sizes, message, memory[0])
+        return _memory_parts(sizes, message, memory[0], passing=passing)
     except BaseException:
-        lent.close_descriptors()
-        lent.release()
+        message.close_descriptors()
+        message.release()
         raise
 
 
-def _inline_parts(body: memoryview, sizes: list[int], lent: Message) -> Message:
+def _inline_parts(body: memoryview, sizes: list[int], message: Message) -> Message:
     payload, offset = body[: sizes[0]], sizes[0]
     for length in sizes[1:]:
-        lent.buffers.append(memoryview(bytearray(body[offset : offset + length])))
+        message.buffers.append(memoryview(bytearray(body[offset : offset + length])))
         offset += length
-    lent.payload = payload
-    return lent
+    message.payload = payload
+    return message
 
 
-def _memory_parts(sizes: list[int], lent: Message, memory: Descriptor, *, passing: bool) -> Message:
+def _memory_parts(
+    sizes: list[int], message: Message, memory: Descriptor, *, passing: bool
+) -> Message:
     """Take the parts out of the sender's block: by a copy that frees it, or for good if it is
-    large; or lend them, to who is ``passing`` them on.
+    large.  A caller that is ``passing`` them on may use them in place.
     """
     offsets, total = _offsets(sizes)
     mapped = in_place(memory, total) if passing else None
@@ -532,11 +534,13 @@ def _memory_parts(sizes: list[int], lent: Message, memory: Descriptor, *, passin
         fd = memory.fileno()
         views = [_copy_out(fd, at, size) for at, size in zip(offsets, sizes, strict=True)]
         release(fd)
-    lent.release()
-    return Message(views[0], views[1:], lent.fds)
+    message.release()
+    return Message(views[0], views[1:], message.fds)
 
 
-def _passed_parts(rest: memoryview, sizes: list[int], lent: Message, memory: Descriptor) -> Message:
+def _passed_parts(
+    rest: memoryview, sizes: list[int], message: Message, memory: Descriptor
+) -> Message:
     """Map the parts, which have no other user, or copy them if they are not large."""
     table = _SIZE.size * len(sizes)
     offsets = [offset for (offset,) in _SIZE.iter_unpack(rest[:table])]
@@ -547,11 +551,11 @@ def _passed_parts(rest: memoryview, sizes: list[int], lent: Message, memory: Des
         views = [mapped[at : at + size] for at, size in places]
     else:
         fd = memory.fileno()
-        views = [_copy_out(fd, at, size) if at else lent.payload for at, size in places]
+        views = [_copy_out(fd, at, size) if at else message.payload for at, size in places]
     if not offsets[0]:
         views[0] = memoryview(bytes(rest[table : table + sizes[0]]))
-    lent.release()
-    return Message(views[0], views[1:], lent.fds)
+    message.release()
+    return Message(views[0], views[1:], message.fds)
 
 
 def _copy_out(memory: int, offset: int, size: int) -> memoryview:

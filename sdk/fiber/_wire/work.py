@@ -32,7 +32,8 @@ from collections.abc import Iterable, Sequence
 from itertools import chain
 from typing import Any, NamedTuple
 
-from fiber._wire.packet import INLINE_LIMIT, BytesLike
+from fiber._wire.memory_files import BytesLike
+from fiber._wire.packet import INLINE_LIMIT
 
 MAP, STAR, CALLS, STOP = range(4)
 UNREADABLE, UNKNOWN, BROKEN, READY = "unreadable", "unknown", "broken", "ready"
