@@ -30,8 +30,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 from fiber._hub import client as hub_client
 from fiber._managers import SERIALIZER, client
 from fiber._managers.asynchronous import AsyncBaseProxy, AsyncProxyResult
-from fiber._managers.door import ManagerAddress
-from fiber._managers.rlock import RLock, condition
+from fiber._managers.client import ManagerAddress
+from fiber._managers.locks import ManagedRLock, condition
 from fiber._managers.server import Server
 from fiber._runtime.state import runtime
 from fiber.connection import Connection, Pipe
@@ -125,7 +125,7 @@ class BaseManager(mp_managers.BaseManager):
     ) -> None:
         self._pool = pool
         self._starting: Connection | None = None
-        self._session: client.Session | None = None
+        self._session: client.ManagerSession | None = None
         if serializer == "pickle" and (address is None or isinstance(address, ManagerAddress)):
             serializer = SERIALIZER
         super().__init__(address, authkey, serializer, ctx, shutdown_timeout=shutdown_timeout)
@@ -351,7 +351,11 @@ class AsyncManager(BaseManager):
         super().register(typeid, callable, proxytype or AsyncBaseProxy, *args, **options)
 
 
-_OURS: dict[str, Callable[..., Any]] = {"Condition": condition, "Pool": _pool, "RLock": RLock}
+_OURS: dict[str, Callable[..., Any]] = {
+    "Condition": condition,
+    "Pool": _pool,
+    "RLock": ManagedRLock,
+}
 
 for _typeid, _callable in _OURS.items():
     _, _exposed, _typeids, _proxytype = _mp.SyncManager._registry[_typeid]

@@ -20,7 +20,7 @@ import pytest
 
 import fiber
 from census import wait_until
-from fiber._managers.client import Line
+from fiber._managers.client import CallChannel
 from fiber._runtime.state import runtime
 from fiber.managers import BaseManager, RemoteError, SyncManager
 from fiber.process import current_process
@@ -249,22 +249,22 @@ def test_an_item_that_nobody_waits_for_any_more_is_the_next_ones(
 ) -> None:
     queue = manager.Queue()
     with monkeypatch.context() as patch:
-        patch.setattr(Line, "answer", interrupt)
+        patch.setattr(CallChannel, "answer", interrupt)
         with pytest.raises(KeyboardInterrupt):
             queue.get()
     queue.put("kept")
     assert queue.get(True, PATIENCE) == "kept"
 
 
-def interrupt(_line: Line) -> None:
+def interrupt(_channel: CallChannel) -> None:
     raise KeyboardInterrupt
 
 
 def test_what_had_come_when_its_call_was_interrupted_is_the_next_ones(
     manager: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def interrupt_late(line: Line) -> None:
-        line._channel.poll(PATIENCE)
+    def interrupt_late(channel: CallChannel) -> None:
+        channel._channel.poll(PATIENCE)
         raise KeyboardInterrupt
 
     queue, lock, condition = manager.Queue(), manager.Lock(), manager.Condition()
@@ -272,7 +272,7 @@ def test_what_had_come_when_its_call_was_interrupted_is_the_next_ones(
     queue.put(2)
     for call in (queue.get, lock.acquire, condition.acquire):
         with monkeypatch.context() as patch:
-            patch.setattr(Line, "answer", interrupt_late)
+            patch.setattr(CallChannel, "answer", interrupt_late)
             with pytest.raises(KeyboardInterrupt):
                 call()
     assert [queue.get(), queue.get()] == [1, 2]
@@ -287,7 +287,7 @@ def test_an_interruption_takes_nothing_of_an_earlier_call_back(
     queue.put(1)
     assert queue.get() == 1
     with monkeypatch.context() as patch:
-        patch.setattr(Line, "answer", interrupt)
+        patch.setattr(CallChannel, "answer", interrupt)
         with pytest.raises(KeyboardInterrupt):
             queue.qsize()
     assert queue.empty()

@@ -1,14 +1,15 @@
 """Connections between a manager's proxies and its server, over Fiber's channels.
 
-Proxies and managers are multiprocessing's own.  How they connect they look up in a table there,
-by the name of a serializer; this adds one more.  Whoever unpickles an address imports this.
+Proxies and managers are multiprocessing's classes.  They look up how to connect in a table of
+multiprocessing, by the name of a serializer.  This package adds one entry to that table.  A process
+that unpickles the address of a manager imports this package.
 """
 
 from multiprocessing import managers as _mp
 
 from fiber._managers.client import connect
-from fiber._managers.door import Door
+from fiber._managers.server import ManagerListener
 
 SERIALIZER = "fiber"
 
-_mp.listener_client[SERIALIZER] = (Door, connect)  # type: ignore[attr-defined]
+_mp.listener_client[SERIALIZER] = (ManagerListener, connect)  # type: ignore[attr-defined]

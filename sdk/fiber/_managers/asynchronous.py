@@ -5,7 +5,7 @@
     proxy ── Pipeline ── calls, one after the other ──► a thread of the server, for this proxy alone
                  ◄────── answers, in the same order
 
-An answer is taken in by whoever waits for any of them, and kept for who asks for it.
+A thread that waits for one result reads the answers of all.  Each answer is kept in its result.
 """
 
 from __future__ import annotations
@@ -23,19 +23,18 @@ from typing import Any
 from fiber import reduction
 from fiber._exceptions import fresh
 from fiber._hub.client import Unreachable
-from fiber._managers.client import Session, new_owner, proxy_of, session
-from fiber._managers.door import NUMBER
+from fiber._managers.client import NUMBER, ManagerSession, new_holder, proxy_of, session
 from fiber._runtime.latch import Waiters, acquire
 from fiber.errors import ConnectionClosed, TimeoutError
 
 _mp: Any = mp_managers  # typeshed has part of it
 
-_A_MOMENT = 1000
-"""Milliseconds after which who waits for room looks again who reads."""
+_READ_AGAIN = 1000
+"""Milliseconds between the checks of a caller that waits for room: does a thread read answers?"""
 
 
 class AsyncProxyResult:
-    """A call under way, with the methods of ``multiprocessing.pool.AsyncResult``."""
+    """Result of a call in progress, with the methods of ``multiprocessing.pool.AsyncResult``."""
 
     def __init__(self, pipeline: Pipeline) -> None:
         self._pipeline = pipeline
@@ -44,12 +43,12 @@ class AsyncProxyResult:
     def get(self, timeout: float | None = None) -> Any:
         """Return the result of the method, each time the same object, or raise its error.
 
-        TimeoutError if it has not ended within ``timeout`` seconds; the call goes on.
-        ConnectionClosed if the manager is gone.
+        TimeoutError if the call has not ended within ``timeout`` seconds; it goes on.
+        ConnectionClosed if the manager has ended.
         """
         if not self._pipeline.wait(self, timeout):
             raise TimeoutError(f"the call has not returned within {timeout:g} s")
-        kind, result = self._pipeline.understood(self)
+        kind, result = self._pipeline.outcome(self)
         if kind == "#RETURN":
             return result
         raise fresh(_mp.convert_to_error(kind, result))
@@ -71,22 +70,25 @@ class AsyncProxyResult:
 
 
 class Pipeline:
-    """The calls of one proxy, each of which may begin before those before it have ended."""
+    """Calls of one proxy.  A call may begin before earlier calls have ended."""
 
-    def __init__(self, server: Session) -> None:
+    def __init__(self, server: ManagerSession) -> None:
         self.pid = os.getpid()
         self._session = server
-        self._channel = server.hand_over(new_owner())
+        self._channel = server.open_channel(new_holder())
         self._numbers = itertools.count(1)
         self._answered = 0
         self._sending = threading.RLock()
-        """Calls are sent in the order of their numbers; a signal's handler may call, too."""
+        """Held while a call is sent, so that calls are sent in the order of their numbers.
+
+        Reentrant, as a signal's handler may make a call too.
+        """
         self._pending: dict[int, weakref.ref[AsyncProxyResult]] = {}
         self._reading = threading.Lock()
         self._waiters = Waiters()
 
     def call(self, ident: str, method: str, args: Any, kwds: Any) -> AsyncProxyResult:
-        """Begin a call."""
+        """Begin a call and return its result."""
         try:
             payload, buffers = reduction.encode((ident, method, args, kwds))
         except reduction.REFUSALS as error:
@@ -103,15 +105,18 @@ class Pipeline:
         return result
 
     def _make_room(self) -> None:
-        """The server reads no calls, perhaps since nobody reads its answers."""
+        """Wait for room for a call.
+
+        If the server reads no calls because no thread reads its answers, read one.
+        """
         poller = select.poll()
         poller.register(self._channel.fileno(), select.POLLIN | select.POLLOUT)
-        readable = any(events & select.POLLIN for _, events in poller.poll(_A_MOMENT))
+        readable = any(events & select.POLLIN for _, events in poller.poll(_READ_AGAIN))
         if readable and self._reading.acquire(blocking=False):
             self._read(0)
 
     def wait(self, result: AsyncProxyResult, timeout: float | None) -> bool:
-        """Wait for a call's end; False if ``timeout`` seconds are over first."""
+        """Wait until a call has ended; return False after ``timeout`` seconds."""
         deadline = None if timeout is None else time.monotonic() + timeout
         while result._outcome is None:
             left = None if deadline is None else max(0.0, deadline - time.monotonic())
@@ -131,11 +136,14 @@ class Pipeline:
             self._waiters.leave(lock)
 
     def _read(self, timeout: float | None) -> bool:
-        """Take in one answer, if it comes; the lock for that is held, and released."""
+        """Read one answer; return False if none comes within ``timeout`` seconds.
+
+        The caller holds the lock for reading, which is released here.
+        """
         try:
             if not self._channel.poll(timeout):
                 return False
-            self._take_in(*self._next())
+            self._store(*self._next())
             return True
         except _Ended:
             self._end()
@@ -149,22 +157,22 @@ class Pipeline:
             answer: tuple[int, str, Any] = self._channel.recv_object()
             return answer
         except ConnectionClosed as error:
-            if isinstance(error, Unreachable):  # something in the answer
+            if isinstance(error, Unreachable):  # an object in the answer is, not the server
                 return self._answered + 1, "#ERROR", error
             raise _Ended from error
-        except Exception as error:  # it does not unpickle
+        except Exception as error:  # the answer does not unpickle
             return self._answered + 1, "#ERROR", error
 
-    def _take_in(self, number: int, kind: str, value: Any) -> None:
-        for lost in range(self._answered + 1, number):  # its reader was interrupted
+    def _store(self, number: int, kind: str, value: Any) -> None:
+        for lost in range(self._answered + 1, number):  # the thread that read it was interrupted
             self._settle(lost, "#ERROR", InterruptedError("the answer was lost to a signal"))
         self._answered = number
         if not self._settle(number, kind, value) and kind == "#PROXY":
-            self._session.got_reference()
-            self._session.let_go(str(value[1].id))
+            self._session.add_reference()
+            self._session.drop_reference(str(value[1].id))
 
     def _settle(self, number: int, kind: str, value: Any) -> bool:
-        """Settle a call; return whether its result is still wanted."""
+        """Store the outcome of a call; return False if its result was forgotten."""
         reference = self._pending.pop(number, None)
         result = None if reference is None else reference()
         if result is None:
@@ -173,13 +181,13 @@ class Pipeline:
         return True
 
     def _end(self) -> None:
-        error = self._session.gone()
+        error = self._session.closed_error()
         for number in list(self._pending):
             self._settle(number, "#ERROR", error)
         self._waiters.wake()
 
-    def understood(self, result: AsyncProxyResult) -> tuple[str, Any]:
-        """The outcome of a call that has ended, on its caller's thread."""
+    def outcome(self, result: AsyncProxyResult) -> tuple[str, Any]:
+        """Return the outcome of a call that has ended.  Runs on its caller's thread."""
         assert result._outcome is not None
         kind, value = result._outcome
         if kind == "#PROXY":
@@ -188,14 +196,14 @@ class Pipeline:
 
 
 class _Ended(Exception):
-    """No more answers come."""
+    """Signal that the channel is closed and no more answers come."""
 
 
 class AsyncBaseProxy(mp_managers.BaseProxy):
-    """A proxy of which every method returns an ``AsyncProxyResult`` at once.
+    """Proxy whose methods return an ``AsyncProxyResult`` at once.
 
-    Calls by one proxy are made one after the other, in their order, and those by different proxies
-    side by side.
+    The server runs the calls of one proxy one after the other, in their order.  Calls of different
+    proxies run at the same time.
     """
 
     _token: Any
@@ -220,12 +228,12 @@ class AsyncBaseProxy(mp_managers.BaseProxy):
     ) -> AsyncProxyResult:
         """Begin a call of any exposed method, ``__getitem__`` for instance."""
         calls, token = self._calls, self._token
-        if calls is None or calls.pid != os.getpid():  # else forked
+        if calls is None or calls.pid != os.getpid():  # none yet, or this process was forked
             calls = self._calls = Pipeline(session(token.address))
         return calls.call(token.id, methodname, args, kwds or {})
 
     def _getvalue(self) -> AsyncProxyResult:
-        """A copy of the object."""
+        """Begin to fetch a copy of the object."""
         return self._callmethod("#GETVALUE")
 
     def __reduce__(self) -> tuple[Any, ...]:

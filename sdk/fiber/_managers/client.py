@@ -1,21 +1,24 @@
-"""The client's side: a session with each manager's server that this process knows.
+"""The client's side: a session with each manager's server that this process uses.
 
 ::
 
-    proxies of this process ── Request ── Line, one a thread ──► a thread of the server
-                                  └────── control ────────────►  who this process is, what it lets
-                                                                 go, and by its end: that it is gone
+    proxies ── ManagerConnection ── CallChannel, for each thread ──► a thread of the server
+                    └──────────── control channel ────────────────►  notices of this process
 
-A line has one call under way at a time.  What is said on the control channel has no answer, so that
-a finalizer may say it wherever the garbage collector runs.
+A call channel has one call in progress at a time.  Notices on the control channel have no answer,
+so a finalizer may send one wherever the garbage collector runs.  A notice opens a call channel, or
+changes a reference count.  The end of the control channel tells the server that this process ended.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import itertools
 import os
 import pickle
+import struct
+import time
 import warnings
 import weakref
 from collections import deque
@@ -23,21 +26,35 @@ from multiprocessing import util
 from multiprocessing.managers import Token
 from multiprocessing.process import BaseProcess, current_process
 from threading import current_thread, main_thread
-from typing import Any
+from typing import Any, NamedTuple
 
 from fiber import reduction
 from fiber._hub import handles
 from fiber._hub.client import Unreachable, host
-from fiber._hub.handles import collecting_grants
+from fiber._hub.handles import HubHandle, collecting_grants
 from fiber._hub.local import LocalChannel
-from fiber._managers.door import NUMBER, TAKE_BACK, ManagerAddress, knock
 from fiber._transport.base import Channel
 from fiber._wire import packet
 from fiber.connection import how_it_ended
 from fiber.errors import ConnectionClosed
 
+NUMBER = struct.Struct("<Q")
+"""Number of a call, before the call on its channel and in its answer.
+
+A number that a channel skips belongs to a call that was interrupted while it was sent.
+"""
+
+TAKE_BACK = "take_back"
+"""Method of the server: undo the last call of a channel, whose caller was interrupted."""
+
+JOIN, OPEN_CHANNEL, INCREF, DECREF, LEAVE = "join", "line", "incref", "decref", "bye"
+"""First words of the notices to a server."""
+
 _LOOK_AGAIN = 0.5
-"""Seconds after which whoever waits to be let in looks whether anybody is there."""
+"""Seconds between checks that the server is alive, while it has not taken a new channel."""
+
+_FILES_AGAIN = 0.05
+"""Seconds between attempts to receive a channel when this process may open no more files."""
 
 _ACQUIRING = ("acquire", "wait")
 """Methods whose results are no objects of the user's."""
@@ -46,15 +63,44 @@ _BEFORE_EXIT = -50
 """Exit priority: after the managers of this process have been shut down."""
 
 
-class Line:
-    """A channel to a thread of the server."""
+class ManagerAddress(NamedTuple):
+    """Value of ``manager.address`` where none was chosen.  Any process of the program may use it.
+
+    A process that has it may use every object of the manager, so its repr does not show it.
+    """
+
+    server: str
+    """Description of the server's process."""
+    listener: HubHandle
+
+    def __repr__(self) -> str:
+        return f"<address of {self.server}>"
+
+
+def receive_notice(channel: Channel) -> Any:
+    """Return the next notice on a channel; skip notices of processes that have ended."""
+    while True:
+        notice = channel.recv().tobytes()
+        while True:
+            try:
+                return pickle.loads(notice)
+            except OSError as error:
+                if error.errno not in (errno.EMFILE, errno.ENFILE):
+                    break
+                time.sleep(_FILES_AGAIN)  # the sender waits for an answer
+            except Exception:
+                break
+
+
+class CallChannel:
+    """Channel to a thread of the server, for the calls of one thread of this process."""
 
     def __init__(self, channel: LocalChannel) -> None:
         self._channel = channel
         self._asked = 0
         self._draining = False
         self.busy = False
-        self.came = False
+        self.answered = False
         """True if the server has answered the last request."""
 
     def ask(self, request: tuple[Any, ...]) -> None:
@@ -64,18 +110,18 @@ class Line:
         self._channel.send(NUMBER.pack(self._asked) + payload, buffers)
 
     def answer(self) -> tuple[str, Any]:
-        """The answer to the last request."""
-        self.came = False
+        """Return the answer to the last request."""
+        self.answered = False
         while True:
             message = self._channel.recv_answer()
-            self.came = True
+            self.answered = True
             number, kind, result = packet.loads(message)
-            if number == self._asked:  # else an earlier call was interrupted
+            if number == self._asked:  # any other answers an earlier call, which was interrupted
                 return kind, result
-            self.came = False
+            self.answered = False
 
     def take_back(self) -> None:
-        """Take back the last request: its answer is not wanted."""
+        """Have the server undo the last request, whose answer the caller does not read."""
         self._draining = True
         self.ask((None, TAKE_BACK, (), {}))
 
@@ -86,146 +132,147 @@ class Line:
                 number, *_ = self._channel.recv_object()
             except ConnectionClosed:
                 return False
-            except Exception:  # nobody wants it
+            except Exception:  # the answer does not unpickle, and its caller is gone
                 continue
             self._draining = number != self._asked
         return not (self.busy or self._draining)
 
     def close(self) -> None:
-        """End it."""
+        """Close the channel."""
         self._channel.close()
 
 
-class Session:
+class ManagerSession:
     """Session of this process with the server of one manager."""
 
     def __init__(self, address: ManagerAddress) -> None:
         self.address = address
         self.pid = os.getpid()
         self.process: weakref.ref[BaseProcess] | None = None
-        """The server's process, where it is a child of this one."""
+        """The server's process, if it is a child of this one."""
         self._references = 0
         self._ended = False
-        self._said: deque[tuple[str, ...]] = deque()
+        self._notices: deque[tuple[str, ...]] = deque()
         self._of_thread: Any = util.ForkAwareLocal()
         try:
-            door = knock(address)
+            listener = handles.channel(address.listener)
             try:
-                self._control = _hand_over(door, "join", introduction())
+                self._control = _open_channel(listener, JOIN, process_description())
             finally:
-                door.close()
+                listener.close()
         except (ConnectionClosed, BrokenPipeError) as error:
-            raise self.gone() from error
+            raise self.closed_error() from error
 
-    def hand_over(self, owner: str) -> LocalChannel:
-        """A new channel to a new thread of the server.
+    def open_channel(self, holder: str) -> LocalChannel:
+        """Open a channel to a new thread of the server, which acts for the lock holder ``holder``.
 
-        What that acquires, all have that are handed over for the same ``owner``.
+        All channels of one holder share the locks that they acquire.
         """
         try:
-            return _hand_over(self._control, "line", thread_name(), owner)
+            return _open_channel(self._control, OPEN_CHANNEL, thread_name(), holder)
         except (ConnectionClosed, BrokenPipeError) as error:
-            raise self.gone() from error
+            raise self.closed_error() from error
 
-    def line(self) -> Line:
-        """A line of this thread on which no call is under way."""
+    def free_channel(self) -> CallChannel:
+        """Return a channel of this thread that has no call in progress."""
         if self._ended:
-            raise self.gone()
-        lines: list[Line] | None = getattr(self._of_thread, "lines", None)
-        if lines is None:
-            self._of_thread.owner = new_owner()
-            lines = self._of_thread.lines = []
-        for line in lines:
-            if line.is_free():
-                return line
-        return self._new_line()
+            raise self.closed_error()
+        channels: list[CallChannel] | None = getattr(self._of_thread, "channels", None)
+        if channels is None:
+            self._of_thread.holder = new_holder()
+            channels = self._of_thread.channels = []
+        for channel in channels:
+            if channel.is_free():
+                return channel
+        return self._new_channel()
 
-    def _new_line(self) -> Line:
-        line = Line(self.hand_over(self._of_thread.owner))
-        self._of_thread.lines.append(line)
-        return line
+    def _new_channel(self) -> CallChannel:
+        channel = CallChannel(self.open_channel(self._of_thread.holder))
+        self._of_thread.channels.append(channel)
+        return channel
 
-    def replace(self, line: Line) -> None:
-        """Replace a line whose answer is not wanted.  This thread keeps what it has acquired."""
+    def replace(self, channel: CallChannel) -> None:
+        """Replace a channel whose answer is not read.  This thread keeps its locks."""
         with contextlib.suppress(ConnectionClosed):
-            self._new_line()
-        self.give_up(line)
+            self._new_channel()
+        self.give_up(channel)
 
-    def give_up(self, line: Line) -> None:
-        """Close a line whose answer is not wanted."""
-        line.close()
-        lines: list[Line] = getattr(self._of_thread, "lines", [])
-        if line in lines:
-            lines.remove(line)
+    def give_up(self, channel: CallChannel) -> None:
+        """Close a channel whose answer is not read."""
+        channel.close()
+        channels: list[CallChannel] = getattr(self._of_thread, "channels", [])
+        if channel in channels:
+            channels.remove(channel)
 
-    def got_reference(self) -> None:
+    def add_reference(self) -> None:
         """Count a new reference to an object of the manager."""
         self._references += 1
-        _held[self.address] = self
+        _referenced[self.address] = self
 
-    def let_go(self, ident: str) -> None:
-        """Drop a reference.  From anywhere, also from a finalizer."""
-        self.say("decref", ident)
+    def drop_reference(self, ident: str) -> None:
+        """Drop a reference to an object.  May be called from anywhere, also from a finalizer."""
+        self.notify(DECREF, ident)
         self._references -= 1
         if self._references <= 0:
-            _held.pop(self.address, None)
+            _referenced.pop(self.address, None)
 
-    def say(self, *words: str) -> None:
-        """Tell the server, without waiting even for room."""
-        self._said.append(words)
-        while self._said and not self._ended:
+    def notify(self, *notice: str) -> None:
+        """Send the server a notice, without waiting even for room."""
+        self._notices.append(notice)
+        while self._notices and not self._ended:
             try:
-                said = self._said.popleft()
-            except IndexError:  # another thread says it
+                first = self._notices.popleft()
+            except IndexError:  # another thread sends it
                 return
             try:
-                if not self._control.try_send(pickle.dumps(said)):
-                    self._said.appendleft(said)
+                if not self._control.try_send(pickle.dumps(first)):
+                    self._notices.appendleft(first)
                     return
-            except OSError:  # the server is gone
+            except OSError:  # the server has ended
                 return
 
     def close(self) -> None:
-        """End the session in good order.  Locks stay as they are."""
-        _held.pop(self.address, None)
+        """End the session in order.  The server does not release the locks of this process."""
+        _referenced.pop(self.address, None)
         _sessions.pop(self.address, None)
-        self.say("bye")
+        self.notify(LEAVE)
 
     def end(self) -> None:
-        """The server is gone; or, in a forked process, the session is the parent's."""
+        """Close all channels: the server has ended, or this process is a fork of their owner."""
         self._ended = True
         self._control.close()
-        for line in getattr(self._of_thread, "lines", []):
-            line.close()
+        for channel in getattr(self._of_thread, "channels", []):
+            channel.close()
 
     def __del__(self) -> None:
         if hasattr(self, "_control") and self.pid == os.getpid():
-            self.say("bye")
+            self.notify(LEAVE)
 
-    def gone(self) -> ConnectionClosed:
-        """The error of whoever finds the server gone."""
+    def closed_error(self) -> ConnectionClosed:
+        """Return the error for a caller that finds the server's process ended."""
         process = self.process and self.process()
         return ConnectionClosed(self.address.server, how_it_ended(process) if process else None)
 
 
 class Reference:
-    """Keeps an object of a manager while this is alive.  Made and dropped without waiting."""
+    """Reference to an object of a manager.  Made and dropped without waiting."""
 
-    def __init__(self, session: Session, ident: str) -> None:
+    def __init__(self, session: ManagerSession, ident: str) -> None:
         self._session = session
         self._ident = ident
-        session.got_reference()
-        session.say("incref", ident)
+        session.add_reference()
+        session.notify(INCREF, ident)
 
     def __del__(self) -> None:
         if self._session.pid == os.getpid():
-            self._session.let_go(self._ident)
+            self._session.drop_reference(self._ident)
 
 
 class TravellingToken(Token):
-    """A token that keeps its object while it is on its way to another process, where that is known.
+    """Token that keeps its object while the token is on its way to another process.
 
-    In multiprocessing the object may be gone before the process has a proxy of its own.
+    That works where Fiber knows when the token has arrived.  In multiprocessing the object may be
+    gone before the process has a proxy.
     """
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -236,17 +283,17 @@ class TravellingToken(Token):
         return type(self), (self.typeid, address, self.id)
 
 
-def _hand_over(carrier: Channel, *about: str) -> LocalChannel:
-    """A new channel to the server, which has the other end and said so."""
+def _open_channel(carrier: Channel, *notice: str) -> LocalChannel:
+    """Send one end of a new channel to the server; return the other once the server has it."""
     ours, theirs = LocalChannel.pair()
-    # Taken back below: if nobody takes it out, its end is the end of ours.
+    # The grant is taken back below.  If no server receives it, the pipe ends, and so does the wait.
     with collecting_grants(reusable=False) as grants:
-        invitation = pickle.dumps((*about, theirs))
+        invitation = pickle.dumps((*notice, theirs))
     theirs.close()
     try:
         carrier.send(invitation)
         while not ours.poll(_LOOK_AGAIN):
-            if carrier.poll(0):  # nothing ever comes there but the end
+            if carrier.poll(0):  # the server sends nothing there, so this is the end
                 raise ConnectionClosed()
         ours.recv().release()
     finally:
@@ -254,17 +301,17 @@ def _hand_over(carrier: Channel, *about: str) -> LocalChannel:
     return ours
 
 
-class Request:
-    """Connection to the server, as multiprocessing's proxies and managers see it."""
+class ManagerConnection:
+    """Connection to a manager's server, with the methods that multiprocessing's proxies call."""
 
     def __init__(self, address: ManagerAddress) -> None:
         self._address = address
-        self._opened: Session | None = None
-        self._under_way: list[tuple[Line, str, str | None]] = []
+        self._opened: ManagerSession | None = None
+        self._calls: list[tuple[CallChannel, str, str | None]] = []
 
     @property
-    def _session(self) -> Session:
-        if self._opened is None or self._opened.pid != os.getpid():  # forked
+    def _session(self) -> ManagerSession:
+        if self._opened is None or self._opened.pid != os.getpid():  # this process was forked
             self._opened = session(self._address)
         return self._opened
 
@@ -273,48 +320,47 @@ class Request:
         ident, method, args, _ = request
         if ident is None and method == "decref":
             known = _sessions.get(self._address)
-            if known is not None:  # a finalizer may be what asks: it waits for nothing
-                known.let_go(*args)
+            if known is not None:  # a finalizer may call this, so it must not wait
+                known.drop_reference(*args)
             return
-        line = self._session.line()
-        line.busy = True
+        channel = self._session.free_channel()
+        channel.busy = True
         try:
-            line.ask(request)
+            channel.ask(request)
         except BrokenPipeError as error:
-            self._session.give_up(line)
-            raise self._session.gone() from error
+            self._session.give_up(channel)
+            raise self._session.closed_error() from error
         except reduction.REFUSALS as error:
-            line.busy = False
+            channel.busy = False
             raise reduction.blame({f"the arguments of {method}()": request}, error) from error
         except BaseException:
-            self._session.replace(line)  # it may have been sent or not
+            self._session.replace(channel)  # the request may have been sent or not
             raise
-        self._under_way.append((line, method, ident))
+        self._calls.append((channel, method, ident))
 
     def recv(self) -> tuple[str, Any]:
         """Return how the last call ended."""
-        if not self._under_way:
-            return "#RETURN", None  # letting go has no answer
-        line, method, ident = self._under_way.pop()
+        if not self._calls:
+            return "#RETURN", None  # a decref has no answer
+        channel, method, ident = self._calls.pop()
         try:
-            kind, result = line.answer()
+            kind, result = channel.answer()
         except ConnectionClosed as error:
             if isinstance(error, Unreachable):
-                raise  # something in the answer
-            self._session.give_up(line)
-            raise self._session.gone() from error
+                raise  # an object in the answer is unreachable, not the server
+            self._session.give_up(channel)
+            raise self._session.closed_error() from error
         except BaseException as error:
-            # What came and does not unpickle stays with who asked.  All else is a signal's handler.
-            if method in _ACQUIRING or not (line.came and isinstance(error, Exception)):
-                line.take_back()
+            # An answer that came and does not unpickle is the caller's.  Any other error is raised
+            # by a signal's handler.
+            if method in _ACQUIRING or not (channel.answered and isinstance(error, Exception)):
+                channel.take_back()
             raise
         finally:
-            line.busy = False
-        return self._understood(kind, result, method, ident)
+            channel.busy = False
+        return self._interpret(kind, result, method, ident)
 
-    def _understood(
-        self, kind: str, result: Any, method: str, ident: str | None
-    ) -> tuple[str, Any]:
+    def _interpret(self, kind: str, result: Any, method: str, ident: str | None) -> tuple[str, Any]:
         if kind == "#PROXY":
             return "#RETURN", proxy_of(self._session, *result)
         if kind == "#WARNING":
@@ -322,75 +368,77 @@ class Request:
             self._warn(text, ident)
             return "#RETURN", acquired
         if kind == "#RETURN" and ident is None and method in ("create", "incref"):
-            self._session.got_reference()
+            self._session.add_reference()
         return kind, result
 
     def _warn(self, text: str, ident: str | None) -> None:
         try:
             warnings.warn(text, RuntimeWarning, stacklevel=6)
-        except BaseException:  # made an error by a filter: then it is not acquired
+        except BaseException:  # a filter made it an error, so the lock is not acquired
             self.send((ident, "release", (), {}))
             self.recv()
             raise
 
     def close(self) -> None:
-        """Do nothing: the thread keeps its lines."""
+        """Do nothing: the thread keeps its channels."""
 
 
-_sessions: weakref.WeakValueDictionary[ManagerAddress, Session] = weakref.WeakValueDictionary()
-_held: dict[ManagerAddress, Session] = {}
-"""Sessions that have references."""
+_sessions: weakref.WeakValueDictionary[ManagerAddress, ManagerSession] = (
+    weakref.WeakValueDictionary()
+)
+_referenced: dict[ManagerAddress, ManagerSession] = {}
+"""Sessions with references to objects, which keep them alive."""
 
 
-def session(address: ManagerAddress) -> Session:
+def session(address: ManagerAddress) -> ManagerSession:
     """Return this process's session with the server at ``address``."""
     found = _sessions.get(address)
     if found is None:
-        made = Session(address)
-        found = _sessions.setdefault(address, made)  # or another thread was faster
+        made = ManagerSession(address)
+        found = _sessions.setdefault(address, made)  # another thread may have been faster
         _close_at_exit()
     return found
 
 
-def connect(address: ManagerAddress, authkey: bytes | None = None) -> Request:
-    """multiprocessing's ``Client`` for a manager's server.
+def connect(address: ManagerAddress, authkey: bytes | None = None) -> ManagerConnection:
+    """Connect to a manager's server, as multiprocessing's ``Client`` does.
 
-    The key is not asked for: only who was given the address can have it.
+    No key is checked: only a process that received the address can have it.
     """
-    return Request(address)
+    return ManagerConnection(address)
 
 
-def proxy_of(session: Session, make: Any, token: Token, exposed: tuple[str, ...]) -> Any:
-    """The proxy of what a method has returned.
+def proxy_of(session: ManagerSession, make: Any, token: Token, exposed: tuple[str, ...]) -> Any:
+    """Return the proxy of an object that a method has returned.
 
     multiprocessing asks the manager's registry for its class, which only one process has.
     """
     from fiber._managers import SERIALIZER
 
-    session.got_reference()
+    session.add_reference()
     try:
         return make(token, SERIALIZER, exposed=exposed)
     finally:
-        session.let_go(str(token.id))
+        session.drop_reference(str(token.id))
 
 
 def forget(address: ManagerAddress) -> None:
-    """The server has been shut down."""
+    """End the session with a server that has been shut down."""
     session = _sessions.pop(address, None)
-    _held.pop(address, None)
+    _referenced.pop(address, None)
     if session is not None:
         session.end()
 
 
-_owners = itertools.count()
+_holders = itertools.count()
 
 
-def new_owner() -> str:
-    """The name of one who has acquired nothing yet, for this process's servers."""
-    return str(next(_owners))
+def new_holder() -> str:
+    """Return the name of a new lock holder, for the servers that this process uses."""
+    return str(next(_holders))
 
 
-def introduction() -> str:
+def process_description() -> str:
     """Return a description of this process."""
     return f"process {current_process().name!r} (pid {os.getpid()} on host {host()!r})"
 
@@ -416,12 +464,12 @@ def _close_all() -> None:
         one.close()
 
 
-def _forget() -> None:
+def _after_fork() -> None:
     """Forget the sessions in a forked process: they belong to its parent."""
     for one in list(_sessions.values()):
         one.end()
     _sessions.clear()
-    _held.clear()
+    _referenced.clear()
 
 
-os.register_at_fork(after_in_child=_forget)
+os.register_at_fork(after_in_child=_after_fork)

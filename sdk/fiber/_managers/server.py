@@ -1,26 +1,40 @@
-"""A manager's server: multiprocessing's, with another way in, and an eye on who its clients are.
+"""A manager's server: multiprocessing's, with another listener, and a record of its clients.
 
-Each thread of a client has a thread here, as in multiprocessing; so who acquired an RLock is who
-may release it.  What a process has references to is counted for that process, and let go when it
-is gone.
+Each thread of a client has a thread in the server, as in multiprocessing.  So the thread that
+acquired an RLock is the one that may release it.  The server counts the references of each process,
+and drops them when the process ends.
 """
 
 from __future__ import annotations
 
 import itertools
+import os
 import sys
 import threading
 from contextlib import suppress
 from multiprocessing import managers as mp_managers
 from multiprocessing.managers import Token
+from multiprocessing.process import current_process
 from traceback import format_exc
 from typing import Any
 
 from fiber import reduction
 from fiber._agent.travelling import Travelling
-from fiber._managers.client import TravellingToken
-from fiber._managers.door import NUMBER, TAKE_BACK, received
-from fiber._managers.holdings import CONTENDED, Client, ClientThread, Holdings
+from fiber._hub.handles import GrantSet
+from fiber._hub.local import LocalChannel
+from fiber._hub.protocol import ObjectKind
+from fiber._managers.client import (
+    DECREF,
+    INCREF,
+    LEAVE,
+    NUMBER,
+    OPEN_CHANNEL,
+    TAKE_BACK,
+    ManagerAddress,
+    TravellingToken,
+    receive_notice,
+)
+from fiber._managers.locks import CONTENDED, Client, ClientThread, LockTable
 from fiber._transport.base import Channel
 from fiber._wire import packet
 from fiber._wire.packet import Message
@@ -29,10 +43,34 @@ from fiber.errors import ConnectionClosed
 _mp: Any = mp_managers  # typeshed has part of it
 
 _PROXY = b"RebuildProxy"
-"""Bytes that a pickle has if there is a proxy in it."""
+"""Bytes in every pickle that has a proxy in it."""
 
 _Answer = tuple[str, Any]
 """Kind of an answer, in multiprocessing's words, and its value."""
+
+
+class ManagerListener:
+    """Listener of a manager: a channel that every process with the address may reach."""
+
+    def __init__(self, address: object = None, backlog: int = 0) -> None:
+        self._inbox, outbox = LocalChannel.pair()
+        self._grants = GrantSet()
+        handle = self._grants.for_local(ObjectKind.CHANNEL, outbox.fileno())
+        outbox.close()
+        self.address = ManagerAddress(
+            f"manager {current_process().name!r} (pid {os.getpid()} on host {handle.home.host!r})",
+            handle,
+        )
+
+    def accept(self) -> tuple[str, str, Channel]:
+        """Return the next client: the notice's first word, its name, and its control channel."""
+        notice: tuple[str, str, Channel] = receive_notice(self._inbox)
+        return notice
+
+    def close(self) -> None:
+        """Admit no more clients."""
+        self._grants.release()
+        self._inbox.close()
 
 
 class Server(_mp.Server):  # type: ignore[misc]
@@ -42,7 +80,7 @@ class Server(_mp.Server):  # type: ignore[misc]
         super().__init__(*options)
         self.stop_event = threading.Event()
         self._numbers = itertools.count(1)
-        self._holdings = Holdings()
+        self._locks = LockTable()
 
     def serve_forever(self) -> None:
         """Serve until ``shutdown`` is called, then end the process."""
@@ -54,11 +92,11 @@ class Server(_mp.Server):  # type: ignore[misc]
         sys.exit(0)
 
     def accepter(self) -> None:
-        """Give each client that comes a thread."""
+        """Start a thread for each client that connects."""
         while True:
             try:
                 _, name, control = self.listener.accept()
-            except (OSError, ConnectionClosed):  # nobody can come any more
+            except (OSError, ConnectionClosed):  # the listener is closed
                 return
             _start(self._serve_client, Client(name), control)
 
@@ -68,76 +106,76 @@ class Server(_mp.Server):  # type: ignore[misc]
         try:
             control.send(b"")
             while True:
-                self._heed(client, *received(control))
+                self._handle_notice(client, *receive_notice(control))
         except (OSError, ConnectionClosed):
             pass
         finally:
             control.close()
-            self._let_go(client)
+            self._end_client(client)
 
-    def _heed(self, client: Client, what: str, *about: Any) -> None:
-        if what == "line":
-            _start(self._serve_line, client, *about)
-        elif what == "incref":
+    def _handle_notice(self, client: Client, notice: str, *values: Any) -> None:
+        if notice == OPEN_CHANNEL:
+            _start(self._serve_channel, client, *values)
+        elif notice == INCREF:
             with suppress(KeyError):
-                self.incref(client, *about)
-        elif what == "decref":
-            self.decref(client, *about)
-        elif what == "bye":
-            client.left_in_order = True
+                self.incref(client, *values)
+        elif notice == DECREF:
+            self.decref(client, *values)
+        elif notice == LEAVE:
+            client.closed_in_order = True
 
-    def _let_go(self, client: Client) -> None:
-        self._holdings.end(client)
+    def _end_client(self, client: Client) -> None:
+        self._locks.end(client)
         with client.mutex:
             references = list(client.references.elements())
             client.references.clear()
         for ident in references:
-            self._forget(ident)
+            self._drop_reference(ident)
 
     # A thread of a client
 
-    def _serve_line(self, client: Client, name: str, owner: str, line: Channel) -> None:
+    def _serve_channel(self, client: Client, name: str, holder: str, channel: Channel) -> None:
         threading.current_thread().name = name
-        thread = ClientThread(self._holdings, client, owner)
+        thread = ClientThread(self._locks, client, holder)
         try:
-            line.send(b"")
+            channel.send(b"")
             while True:
-                thread.kept = self._serve_call(client, thread, line, line.recv())
+                thread.kept = self._serve_call(client, thread, channel, channel.recv())
         except (OSError, ConnectionClosed):
             pass
         finally:
-            line.close()
+            channel.close()
             thread.end()
 
     def _serve_call(
-        self, client: Client, thread: ClientThread, line: Channel, message: Message
+        self, client: Client, thread: ClientThread, channel: Channel, message: Message
     ) -> Any:
         (number,) = NUMBER.unpack_from(message.payload)
         message.payload = message.payload[NUMBER.size :]
         ident, method = None, ""
-        got_before, thread.got = thread.got, None
+        previous, thread.last_result = thread.last_result, None
         answer: _Answer
         try:
             ident, method, args, kwds = packet.loads(message)
             if ident is not None:
                 answer = self._call(client, thread, ident, method, args, kwds)
             elif method == TAKE_BACK:
-                thread.take_back(got_before)
+                thread.take_back(previous)
                 answer = "#RETURN", None
             else:
-                answer = self._own(client, method, args, kwds)
+                answer = self._call_server(client, method, args, kwds)
         except BaseException:
             answer = "#TRACEBACK", format_exc()
         try:
-            return _reply(line, number, answer)
-        except BrokenPipeError:  # it is not there any more, or waits for no answer
-            thread.take_back(thread.got)
+            return _reply(channel, number, answer)
+        except BrokenPipeError:  # the client has ended, or does not wait for the answer
+            thread.take_back(thread.last_result)
             return None
         finally:
             if ident is None and method == "shutdown":
                 self.stop_event.set()
 
-    def _own(self, client: Client, method: str, args: Any, kwds: Any) -> _Answer:
+    def _call_server(self, client: Client, method: str, args: Any, kwds: Any) -> _Answer:
         if method not in self.public:
             raise AttributeError(f"a manager has no {method!r}")
         return "#RETURN", getattr(self, method)(client, *args, **kwds)
@@ -145,7 +183,7 @@ class Server(_mp.Server):  # type: ignore[misc]
     def _call(
         self, client: Client, thread: ClientThread, ident: str, method: str, args: Any, kwds: Any
     ) -> _Answer:
-        obj, exposed, typeids = self._found(ident)
+        obj, exposed, typeids = self._look_up(ident)
         function = getattr(obj, method, None) if method in exposed else None
         if function is None:
             fallback = self.fallback_mapping.get(method)
@@ -159,27 +197,29 @@ class Server(_mp.Server):  # type: ignore[misc]
                 return thread.call(obj, method, function, args, kwds)
             result = function(*args, **kwds)
         except BaseException as error:  # SystemExit too: the caller waits for an answer
-            return _error(error)
+            return _error_answer(error)
         if typeids and method in typeids:
-            return "#PROXY", self._made(client, typeids[method], result)
+            return "#PROXY", self._create_result(client, typeids[method], result)
         return "#RETURN", result
 
-    def _found(self, ident: str) -> Any:
+    def _look_up(self, ident: str) -> Any:
         try:
             return self.id_to_obj[ident]
         except KeyError:
-            raise _gone(ident) from None
+            raise _no_object(ident) from None
 
-    def _made(self, client: Client, typeid: str, obj: Any) -> tuple[Any, Token, tuple[str, ...]]:
+    def _create_result(
+        self, client: Client, typeid: str, obj: Any
+    ) -> tuple[Any, Token, tuple[str, ...]]:
         ident, exposed = self.create(client, typeid, obj)
         return self.registry[typeid][-1], TravellingToken(typeid, self.address, ident), exposed
 
-    # What managers ask of the server itself; ``c`` is the client
+    # Methods that managers call of the server itself; ``c`` is the client
 
     def create(
         self, c: Any, typeid: str, /, *args: Any, **kwds: Any
     ) -> tuple[str, tuple[str, ...]]:
-        """Make an object; its id and the names of its methods."""
+        """Make an object; return its id and the names of its methods."""
         make, exposed, typeids, _ = self.registry[typeid]
         if make is not None:
             obj = make(*args, **kwds)
@@ -190,7 +230,7 @@ class Server(_mp.Server):  # type: ignore[misc]
         if exposed is None:
             exposed = _mp.public_methods(obj)
         names = (*exposed, *(typeids or ()))
-        # Not the object's own id, which the next one may have while this one is being dropped.
+        # No ``id(obj)``: another object may have the same while this one is being dropped.
         ident = format(next(self._numbers), "x")
         with self.mutex:
             self.id_to_obj[ident] = (obj, frozenset(names), typeids)
@@ -199,65 +239,65 @@ class Server(_mp.Server):  # type: ignore[misc]
         return ident, names
 
     def incref(self, c: Any, ident: str) -> None:
-        """The client has one more reference."""
+        """Count one more reference of the client."""
         with self.mutex:
             if ident not in self.id_to_refcount:
-                raise _gone(ident)
+                raise _no_object(ident)
             self.id_to_refcount[ident] += 1
         with c.mutex:
             c.references[ident] += 1
-        if c.gone:
-            self._let_go(c)
+        if c.ended:
+            self._end_client(c)
 
     def decref(self, c: Any, ident: str) -> None:
-        """The client has one less."""
+        """Count one reference of the client less."""
         with c.mutex:
             if not c.references[ident]:
                 return
             c.references[ident] -= 1
-        self._forget(ident)
+        self._drop_reference(ident)
 
-    def _forget(self, ident: str) -> None:
+    def _drop_reference(self, ident: str) -> None:
         with self.mutex:
             self.id_to_refcount[ident] -= 1
             if self.id_to_refcount[ident]:
                 return
             del self.id_to_refcount[ident]
             last = self.id_to_obj.pop(ident)
-        del last  # not before: with it may go proxies, and then other objects
+        del last  # without the mutex: it may hold proxies, whose end drops other objects
 
     def accept_connection(self, c: Any, name: str) -> None:
-        """A proxy begins: nothing is left to do."""
+        """Do nothing: the client's thread has its channel already."""
 
     def shutdown(self, c: Any) -> None:
-        """End the process, once this is answered."""
+        """End the process, once this call is answered."""
 
 
 def _start(target: Any, *args: Any) -> None:
     threading.Thread(target=target, args=args, daemon=True).start()
 
 
-def _gone(ident: str) -> KeyError:
+def _no_object(ident: str) -> KeyError:
     return KeyError(
         f"the manager's object {ident!r} is gone: it went with its last proxy. Keep a proxy until "
         "the process that was sent one has received it"
     )
 
 
-def _error(error: BaseException) -> _Answer:
-    """An error of the object's own, which is raised as it is where that can be."""
+def _error_answer(error: BaseException) -> _Answer:
+    """Return the answer for an error that a method raised: the error itself if it pickles."""
     travelling = Travelling(error)
     return ("#ERROR", travelling) if travelling.whole else ("#TRACEBACK", travelling.text)
 
 
-def _reply(line: Channel, number: int, answer: _Answer) -> Any:
-    """Send an answer; the result, if it has proxies in it."""
+def _reply(channel: Channel, number: int, answer: _Answer) -> Any:
+    """Send an answer; return the result if it has proxies in it."""
     try:
         payload, buffers = reduction.encode((number, *answer))
-        line.send(payload, buffers)
+        channel.send(payload, buffers)
     except BrokenPipeError:
         raise
-    except BaseException:  # it does not pickle, or there is no memory for it
+    except BaseException:  # the answer does not pickle, or there is no memory for it
         payload, buffers = reduction.encode((number, "#UNSERIALIZABLE", format_exc()))
-        line.send(payload, buffers)
+        channel.send(payload, buffers)
     return answer[1] if _PROXY in payload else None
