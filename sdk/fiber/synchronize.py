@@ -22,8 +22,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar, cast
 
 from fiber._hub import shared_semaphores, wait_lists
 from fiber._hub.local import LocalCounter
-from fiber._sync.abandonment import Abandoned
-from fiber._sync.semaphore import COUNTING, RECURSIVE, SEM_VALUE_MAX
+from fiber._sync.semaphore import COUNTING, RECURSIVE, SEM_VALUE_MAX, Abandoned
 
 if TYPE_CHECKING:
     from multiprocessing import synchronize as mp_synchronize

@@ -300,9 +300,8 @@ class Bytes:
 def simulated(world: World, patch: pytest.MonkeyPatch) -> Callable[[], SharedSemaphore]:
     """Makes a process's view of the semaphore."""
     patch.setattr(module, "time", world)
-    patch.setattr(
-        module, "identity", SimpleNamespace(me=world.me, is_alive=world.is_alive, pid=int)
-    )
+    processes = SimpleNamespace(own_identity=world.me, is_alive=world.is_alive, pid_of=int)
+    patch.setattr(module, "liveness", processes)
     patch.setattr(module, "RobustMutex", lambda _: world)
     patch.setattr(module, "semaphore_at", lambda _, __, maximum: Semaphore(world, maximum))
     patch.setattr(module, "warn_of", lambda _, **__: None)

@@ -94,11 +94,11 @@ def large() -> tuple[Large, SimulatedLoop, RemoteAgent, RemoteChild, Recorder]:
 
 def test_a_start_follows_its_blobs_and_a_signal_its_start(large: Any) -> None:
     link, loop, _, child, _ = large
-    assert link.kinds() == ["Blob"]
+    assert link.kinds() == ["KeepBlob"]
     link.leaving.pop(0)()
-    assert link.kinds() == ["Blob", "Start", "Deliver"]
+    assert link.kinds() == ["KeepBlob", "Start", "Deliver"]
     link.leaving.pop(0)()
-    assert link.kinds() == ["Blob", "Start", "Deliver", "Signal", "Recall"]
+    assert link.kinds() == ["KeepBlob", "Start", "Deliver", "Signal", "Recall"]
     child.signal(signal.SIGKILL)
     loop.run_for(0)
     assert link.kinds()[5:] == ["Signal"]
@@ -109,4 +109,4 @@ def test_a_child_whose_agent_is_lost_before_its_start_has_read_nothing(large: An
     agent.on_lost("silence")
     assert observer.wait_for_exit().unread == (5,)
     link.leaving.pop(0)()
-    assert link.kinds() == ["Blob"]
+    assert link.kinds() == ["KeepBlob"]

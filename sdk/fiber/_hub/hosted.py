@@ -21,8 +21,7 @@ from fiber._hub.local import LocalChannel, LocalCounter
 from fiber._hub.one_way import LOOK_AGAIN, Receiver
 from fiber._hub.protocol import Doorbell, Status
 from fiber._hub.streams import EDGE, IN, OUT, Poller
-from fiber._sync.abandonment import Abandoned
-from fiber._sync.semaphore import COUNTING, SLICE, Block, SharedSemaphore, warn_of
+from fiber._sync.semaphore import COUNTING, SLICE, Abandoned, SharedBlock, SharedSemaphore, warn_of
 from fiber._sync.wait_list import WaitList
 from fiber._transport.loop import Loop
 from fiber._wire.packet import INLINE_LIMIT, Message
@@ -300,7 +299,7 @@ _RELEASE_AGAIN = 0.005
 class HostedSemaphore:
     """Semaphore that the hub serves.  Runs on the loop's thread."""
 
-    def __init__(self, loop: Loop, doorbell: Doorbell, block: Block) -> None:
+    def __init__(self, loop: Loop, doorbell: Doorbell, block: SharedBlock) -> None:
         self._loop = loop
         self._doorbell = doorbell
         # A view of its own, and no recursive one: the tokens are not this process's.
@@ -383,7 +382,7 @@ _LOOK = 1.0
 class HostedWaitList:
     """Wait list that the hub serves.  Runs on the loop's thread."""
 
-    def __init__(self, loop: Loop, doorbell: Doorbell, block: Block) -> None:
+    def __init__(self, loop: Loop, doorbell: Doorbell, block: SharedBlock) -> None:
         self._loop = loop
         self._doorbell = doorbell
         self.places = WaitList(block, self._serve)

@@ -36,7 +36,7 @@ from typing import Any, TypeVar
 from fiber._hub import heap
 from fiber._hub.local import LocalChannel
 from fiber._hub.protocol import ObjectKind
-from fiber._sync.robust_mutex import RobustMutex
+from fiber._sync.liveness import RobustMutex
 from fiber._transport.unix import BorrowedSocket, wait_readable, wait_until
 from fiber._wire import packet
 from fiber._wire.descriptor import Descriptor

@@ -25,8 +25,7 @@ from fiber._hub.handles import (
 )
 from fiber._hub.protocol import Extent, ObjectKind, Op, Status
 from fiber._hub.remote import RemoteObject
-from fiber._sync.abandonment import Abandoned
-from fiber._sync.semaphore import RECURSIVE, SIZE, SharedSemaphore
+from fiber._sync.semaphore import RECURSIVE, SIZE, Abandoned, SharedSemaphore
 
 
 class RemoteSemaphore(RemoteObject):

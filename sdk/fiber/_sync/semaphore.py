@@ -49,11 +49,10 @@ from _multiprocessing import SemLock  # type: ignore[import-not-found]  # it has
 from collections.abc import Callable, Iterable, Iterator
 from itertools import compress, starmap
 from multiprocessing import current_process
-from typing import Protocol
+from typing import TYPE_CHECKING, Any, Protocol, Self, cast
 
-from fiber._sync import identity
-from fiber._sync.abandonment import Abandoned
-from fiber._sync.robust_mutex import RobustMutex
+from fiber._sync import liveness
+from fiber._sync.liveness import RobustMutex
 
 RECURSIVE, COUNTING = 0, 1  # SemLock's kinds, in its own numbers
 SEM_VALUE_MAX: int = SemLock.SEM_VALUE_MAX
@@ -100,7 +99,36 @@ _NO_WAIT = (False,)
 _libc = ctypes.PyDLL(None, use_errno=True)
 
 
-class Block(Protocol):
+if TYPE_CHECKING:
+    # No class can inherit from bool, and `acquire` returns a bool to those who do not care.
+    _Bool = bool
+else:
+    _Bool = int
+
+
+class Abandoned(_Bool):  # type: ignore[misc]  # bool is final
+    """The result of an ``acquire`` that got what another process held when it ended.
+
+    It is true and equal to True, so nobody has to know of it.  What the lock guards may be half
+    changed: who cares tells it by ``isinstance(lock.acquire(), Abandoned)``.
+    """
+
+    holder: str
+    """The process that ended."""
+
+    def __new__(cls, holder: str) -> Self:
+        self: Any = super().__new__(cls, 1)
+        self.holder = holder
+        return cast(Self, self)
+
+    def __repr__(self) -> str:
+        return f"Abandoned(holder={self.holder!r})"
+
+    def __reduce__(self) -> tuple[type[Self], tuple[str]]:
+        return type(self), (self.holder,)
+
+
+class SharedBlock(Protocol):
     """Memory that processes of this host share."""
 
     @property
@@ -121,7 +149,9 @@ class SharedSemaphore:
         "_revivals", "_ring", "_sem", "_take", "_words", "block", "kind", "maximum",
     )  # fmt: skip
 
-    def __init__(self, block: Block, kind: int, ring: Callable[[], None] = lambda: None) -> None:
+    def __init__(
+        self, block: SharedBlock, kind: int, ring: Callable[[], None] = lambda: None
+    ) -> None:
         self.block = block
         self.kind = kind
         self._ring = ring
@@ -145,7 +175,7 @@ class SharedSemaphore:
 
     @classmethod
     def create(
-        cls, block: Block, kind: int, value: int, maximum: int, ring: Callable[[], None]
+        cls, block: SharedBlock, kind: int, value: int, maximum: int, ring: Callable[[], None]
     ) -> SharedSemaphore:
         """Begin the life of one in zeroed memory.
 
@@ -160,7 +190,7 @@ class SharedSemaphore:
 
     def _begin(self) -> None:
         """Begin in a new process, which may be a fork and does not have its parent's tokens."""
-        self._me = identity.me()
+        self._me = liveness.own_identity()
         self._idle: list[int] = []
         self._held: list[int] = []
         self._candidates: Iterator[int] = iter(_SLOTS)
@@ -241,7 +271,7 @@ class SharedSemaphore:
     def try_acquire(self) -> bool | Abandoned:
         """Take a token if there is one, and look for none that are lost: it takes no time."""
         taken: list[int] = []
-        return self._try_acquire(_NO_WAIT, taken) and self._told()
+        return self._try_acquire(_NO_WAIT, taken) and self._acquired_result()
 
     def abandon(self, holder: str) -> None:
         """Have the next one to acquire it know who had it."""
@@ -255,7 +285,7 @@ class SharedSemaphore:
         taken: list[int] = []
         try:
             if self._try_acquire(_NO_WAIT, taken) or self._wait(block, timeout, taken):
-                return self._told()
+                return self._acquired_result()
             return False
         except BaseException:
             if taken:
@@ -315,7 +345,7 @@ class SharedSemaphore:
             self._sem._after_fork()  # it is not: the count is zero
         self._words[slot] = _LEFT
 
-    def _told(self) -> bool | Abandoned:
+    def _acquired_result(self) -> bool | Abandoned:
         """Return the result for an acquirer: the first one after a death is told of it."""
         if not self._bytes[_ABANDONED]:
             return True
@@ -439,12 +469,12 @@ class SharedSemaphore:
 
     def _is_gone(self, slot: int) -> bool:
         who = self._words[slot + _WHO]
-        return self._words[slot] == _LEFT or not (who == self._me or identity.is_alive(who))
+        return self._words[slot] == _LEFT or not (who == self._me or liveness.is_alive(who))
 
     def _name(self, slot: int) -> str:
         start = 8 * (slot + _NAME)
         name = _text(self._bytes[start : start + _NAME_BYTES])
-        return f"{name} (pid {identity.pid(self._words[slot + _WHO])})"
+        return f"{name} (pid {liveness.pid_of(self._words[slot + _WHO])})"
 
     def _claim(self) -> int:
         """Claim another slot for this process.  Called with the mutex."""

@@ -17,8 +17,8 @@ from collections.abc import Callable, Iterator
 from itertools import filterfalse, islice
 from typing import Protocol
 
-from fiber._sync import identity
-from fiber._sync.semaphore import SLICE, Block, make_semaphore, semaphore_at
+from fiber._sync import liveness
+from fiber._sync.semaphore import SLICE, SharedBlock, make_semaphore, semaphore_at
 
 SIZE = 1 << 15
 
@@ -48,7 +48,7 @@ class WaitList:
 
     __slots__ = ("__weakref__", "_ring", "_words", "block")
 
-    def __init__(self, block: Block, ring: Callable[[], None] = lambda: None) -> None:
+    def __init__(self, block: SharedBlock, ring: Callable[[], None] = lambda: None) -> None:
         self.block = block
         self._ring = ring
         self._words = block.view.cast("q")
@@ -62,7 +62,7 @@ class WaitList:
         words[place] = _WAITS_AFAR if afar else _WAITS
         words[_TICKET] = words[place + _CAME] = words[_TICKET] + 1
         words[place + _HELD] = 0
-        words[place + _WHO] = identity.me()  # last: from here on it is taken
+        words[place + _WHO] = liveness.own_identity()  # last: from here on it is taken
         return place
 
     def sleep(self, place: int, timeout: float | None) -> None:
@@ -167,4 +167,4 @@ class WaitList:
 
     def _is_dead(self, place: int) -> bool:
         words = self._words
-        return words[place] == _LOST or not identity.is_alive(words[place + _WHO])
+        return words[place] == _LOST or not liveness.is_alive(words[place + _WHO])

@@ -1,18 +1,72 @@
-"""A mutex in shared memory that the kernel releases when its holder dies.
+"""Primitives in shared memory that survive the death of a process.
 
-It guards what is done rarely; a lock of the program's must not be one, since only the thread that
-locked it may unlock it.
+The *identity* of a process is one word, by which other processes see whether it is alive.  A pid
+alone is not enough, as the kernel gives it to another process later.  So the word also holds the
+time at which the process started, as the kernel counts it.
+
+A ``RobustMutex`` is released by the kernel when its holder dies.  It guards what is done rarely.
+The program's locks are not robust mutexes, since only the thread that locked such a mutex may
+unlock it.
 """
 
 from __future__ import annotations
 
 import ctypes
 import errno
+import os
 import time
 from collections.abc import Callable
 from typing import TypeVar
 
-SIZE = 64
+_PID = (1 << 31) - 1
+_START = (1 << 32) - 1
+
+
+def own_identity() -> int:
+    """The word for this process."""
+    global _me
+    if _me is None:
+        _me = _own()
+    return _me
+
+
+def _own() -> int:
+    pid = os.getpid()
+    start = _start_time(pid)
+    assert start is not None
+    return start << 31 | pid
+
+
+def pid_of(who: int) -> int:
+    """The pid in a word."""
+    return who & _PID
+
+
+def is_alive(who: int) -> bool:
+    """Tell whether that process still runs.  One that has ended and was not reaped does not."""
+    return _start_time(who & _PID) == who >> 31
+
+
+def _after_fork() -> None:
+    global _me
+    _me = None
+
+
+_me: int | None = None
+os.register_at_fork(after_in_child=_after_fork)
+
+
+def _start_time(pid: int) -> int | None:
+    try:
+        with open(f"/proc/{pid}/stat", "rb") as file:
+            # The name before it may have any character in it, the last parenthesis is its end.
+            fields = file.read().rpartition(b")")[2].split()
+    except (FileNotFoundError, ProcessLookupError):
+        return None
+    return None if fields[0] in b"ZX" else int(fields[19]) & _START
+
+
+MUTEX_SIZE = 64
 """Bytes that it takes; some are spare."""
 
 _RECURSIVE, _ROBUST, _SHARED = 1, 1, 1
@@ -34,7 +88,7 @@ class RobustMutex:
 
     def create(self) -> None:
         """Make it.  Recursive: a finalizer may come in the middle of what it guards."""
-        attributes = ctypes.create_string_buffer(SIZE)
+        attributes = ctypes.create_string_buffer(MUTEX_SIZE)
         _check(_libc.pthread_mutexattr_init(attributes))
         _check(_libc.pthread_mutexattr_setpshared(attributes, _SHARED))
         _check(_libc.pthread_mutexattr_setrobust(attributes, _ROBUST))
