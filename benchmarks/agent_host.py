@@ -1,9 +1,10 @@
-"""A process with many fake agents, each with a link of its own: `python -m benchmarks.agent_host`.
+"""Process with many fake agents, each with its own link: `python -m benchmarks.agent_host`.
 
-The links are real, from dialling to the last frame, and so is `AgentService`, which does what the
-master's frames say. Only the children are fake. It reads one JSON object from standard input, what
-`Order` holds, and ends when all its agents have ended, or when standard input does. Standard output
-says "up" before it reads, and why an agent could not join, which ends the process.
+The links are real, from dialling to the last frame. So is `AgentService`, which does what the
+master's frames say. Only the children are fake. The process reads one JSON object, an `Order`, from
+standard input. It ends when all its agents have ended, or when standard input ends. Standard output
+has "up" before the process reads, and the reason if an agent could not join, which ends the
+process.
 """
 
 from __future__ import annotations
@@ -26,35 +27,35 @@ from fiber._transport.loop import Loop
 
 @dataclass(frozen=True)
 class Order:
-    """Which agents to be, and for which master."""
+    """Agents to play, and their master."""
 
     address: str
     credentials: list[dict[str, Any]]
-    """The fields of `Credentials`, of each agent."""
+    """Fields of `Credentials`, for each agent."""
     timeout: float
 
     def to_line(self) -> str:
-        """For standard input."""
+        """Return the line for standard input."""
         return json.dumps(asdict(self)) + "\n"
 
     @classmethod
     def from_line(cls, line: str) -> Order:
-        """What `to_line` made."""
+        """Return the order that `to_line` described."""
         return cls(**json.loads(line))
 
 
 class _NoHub:
-    """No object is shared here: all that a service asks of a hub, and of its link to another."""
+    """Hub without objects: all that a service asks of a hub, and of its link to another."""
 
     def link(self, *_: object, **__: object) -> _NoHub:
-        """There will be no frames for it."""
+        """Do nothing: no frames will come."""
         return self
 
     def flush(self) -> None:
-        """No memory is shared, either."""
+        """Return no memory, because none is shared."""
 
     def unlink(self, *_: object) -> None:
-        """Nor is there anything to end."""
+        """Do nothing: there is nothing to end."""
 
 
 class AgentHost:
@@ -80,7 +81,7 @@ class AgentHost:
         ]
 
     def _joined(self, link: Link) -> None:
-        # The dialer calls back without saying which; the peer is the master, whoever we are.
+        # The dialer calls back without an address, and its peer is always the master.
         agent: Any = FakeAgent(self._loop, "fake", self._runner)
         hub: Any = _NoHub()
         service = AgentService(
@@ -106,7 +107,7 @@ def _orphaned() -> None:
 
 
 def main() -> None:
-    """Be the agents that standard input asks for."""
+    """Play the agents that standard input describes."""
     loop = Loop()
     print("up", flush=True)
     order = Order.from_line(sys.stdin.readline())

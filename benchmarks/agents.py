@@ -14,20 +14,21 @@ if TYPE_CHECKING:
 
 TITLE = "Many agents"
 ABOUT = """\
-As many agents as a large pool has pods, over links on the loopback interface. Real: everything
-of the master's (pool, scheduler, agents as it sees them, listener), each agent's link from
-dialling to the last frame, with its handshake and encryption, and what the agent does with the
-master's frames. Played: the agents share four processes instead of a process (and a host) each,
-and their children, a pool worker for each agent, are objects in these processes. They unpickle,
-run and answer their tasks by the code of a real worker, in turn. Master and agents share this
-machine's processors, which a thousand pods would not.
+As many agents as a large pool has pods, over links on the loopback interface.
 
-Joined: from the order to dial, when the four processes wait with everything imported, until the
-master has the last link; and the processor time that the master needed for it. Memory: what the
-joining of all added to the PSS of the master, and of the agents' processes, by links. Tasks a
-second: no-ops through `map` on a pool of as many workers, 100,000 in default chunks and 10,000 with
-chunksize 1, when all workers are there and have done the same once; multiprocessing has as many
-forked processes. The limit of open files is raised to the hard one."""
+* Real: the whole master (pool, scheduler, its view of the agents, listener). Each agent's link is
+  real from dialling to the last frame, with handshake, encryption and answers to the master.
+* Fake: the agents share four processes instead of having a process (and a host) each. Their
+  children, one pool worker for each agent, are objects in these processes. They unpickle, run and
+  answer their tasks by the code of a real worker, in turn.
+* Master and agents share this machine's processors, which a thousand pods would not.
+
+Joined: time from the order to dial, when the four processes have imported everything, until the
+master has the last link; and the processor time that the master used meanwhile. Memory: growth of
+the PSS of the master and of the agents' processes while all agents join, divided by the links.
+Tasks a second: no-ops through `map` on a pool of as many workers, 100,000 in default chunks and
+10,000 with chunksize 1, after all workers have done the same once. multiprocessing has as many
+forked processes. The soft limit of open files is raised to the hard one."""
 
 JOINED = Metric("joined", "joined", "s")
 JOINING = Metric("joining", "processor time to join, master", "s")
@@ -41,12 +42,12 @@ _SMALLEST = 8
 
 
 def agents(count: int) -> str:
-    """The name of the case with so many."""
+    """Return the name of the case with `count` agents."""
     return f"{count:,} agents"
 
 
 def cases(size: float) -> list[Case]:
-    """The full measure at size 1; below, fewer tasks, and agents in the same measure."""
+    """Return the full measure at size 1; below, fewer tasks, and agents in the same measure."""
     return [
         Case(
             measure="agents",
@@ -64,7 +65,7 @@ def cases(size: float) -> list[Case]:
 
 
 def run(bench: Bench, agents: int, size: float) -> dict[str, float]:
-    """The links' cost, for whoever has them, and how fast no-ops pass."""
+    """Measure what the links cost, if the contender has links, and how fast no-ops pass."""
     hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
     if bench.contender == BASELINE:
@@ -73,7 +74,7 @@ def run(bench: Bench, agents: int, size: float) -> dict[str, float]:
 
 
 def _with_links(bench: Bench, agents: int, size: float) -> dict[str, float]:
-    # Here, as only Fiber's process needs it installed.
+    # Imported here, because only Fiber's process needs it installed.
     from benchmarks.fake_cluster import FakeCluster, agent_hosts
 
     from fiber._runtime.state import runtime, shutdown

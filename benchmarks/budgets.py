@@ -1,4 +1,4 @@
-"""The budgets of the design and whether a run keeps them."""
+"""Budgets of the design, and whether a run keeps them."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ from benchmarks.samples import in_words, ratio, summary, times
 
 @dataclass(frozen=True)
 class Budget:
-    """A bound on a metric of `contender`: on its ratio to `against`, or on its value in `unit`.
+    """Bound on a metric of `contender`: on its ratio to `against`, or on its value in `unit`.
 
-    With a unit it is the value that counts. With `to_case` the ratio is to the contender's own
-    value in that case. The bound is the greatest value allowed; with `at_least`, the least.
+    With a unit the value counts. With `to_case` the ratio is to the contender's own value in that
+    case. The bound is the greatest allowed value; with `at_least`, the least.
     """
 
     what: str
@@ -48,18 +48,18 @@ class Budget:
 
     @property
     def divisor(self) -> tuple[str, str]:
-        """The case and the contender whose value a ratio is to."""
+        """Case and contender whose value a ratio is to."""
         return (self.to_case, self.contender) if self.to_case else (self.case, self.against)
 
     def in_words(self) -> str:
-        """The bound with its unit."""
+        """Bound with its unit."""
         bound = in_words(self.bound, self.unit) if self.unit else f"{self.bound:g}x"
         return f"{'≥' if self.at_least else '≤'} {bound}"
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """A budget and what was measured; `kept` is None if nothing was."""
+    """Budget and its measured value; `kept` is None if it was not measured."""
 
     budget: Budget
     kept: bool | None
@@ -85,12 +85,12 @@ def judge(budget: Budget, runs: Mapping[str, Run]) -> Verdict:
 
 
 def verdicts(runs: Mapping[str, Run], among: Sequence[Budget] | None = None) -> list[Verdict]:
-    """All budgets of `make bench`, or these, in the design's order."""
+    """Compare all budgets of `make bench`, or these, in the design's order."""
     return [judge(budget, runs) for budget in (BUDGETS if among is None else among)]
 
 
 def of(measure: str, case: str, metric: str, contender: str) -> list[Budget]:
-    """The budgets on one value of a contender."""
+    """Return the budgets on one value of a contender."""
     keys = (measure, case, metric, contender)
     return [b for b in (*BUDGETS, *ON_PODS) if (b.measure, b.case, b.metric, b.contender) == keys]
 
@@ -105,14 +105,15 @@ def _value(budget: Budget, run: Run) -> float | None:
 
 
 def _floor(budget: Budget, run: Run) -> float | None:
-    """The least ratio to Fiber of a rival that was stopped because it was too slow."""
+    """Return the least ratio to Fiber of a rival that was stopped because it was too slow."""
     after = run.unfinished.get(budget.case, {}).get(budget.contender)
     against = summary(run.series(budget.case, budget.against, budget.metric))
     return after / against.median if budget.against == "fiber" and after and against else None
 
 
 def _missed(value: float, budget: Budget) -> str:
-    """By how much of the bound: at least 0.1 %, since a miss of 0 % would read like none."""
+    """Return by how much of the bound the value misses it: at least 0.1 %, since 0 % would read
+    like a hit."""
     percent = max(0.1, abs(value / budget.bound - 1) * 100)
     return f"{percent:,.1f} %" if percent < 100 else f"{percent:,.0f} %"
 
@@ -134,7 +135,8 @@ def _pool() -> Iterator[Budget]:
 
 
 def _executors() -> Iterator[Budget]:
-    """Issue 11 asks for five times concurrent.futures; that against loky, and loops, are ours."""
+    """Return the budgets of executors: issue 11 asks for five times concurrent.futures; loky and
+    loops were added."""
 
     def budget(what: str, measure: str, case: str, bound: float, **rivals: str) -> Budget:
         return Budget(what, measure, case, executors.RATE.name, bound, at_least=True, **rivals)
@@ -146,7 +148,7 @@ def _executors() -> Iterator[Budget]:
             yield budget(what, "executors", case, 5, contender=ours, against=against)
     ours = "fiber-joblib"
     for kind in parallel_loops.TASKS:
-        # Where tasks sleep for longer than anything else takes, there is nothing to be gained.
+        # If tasks sleep for longer than all else takes, no time can be saved.
         bound = 0.98 if kind == parallel_loops.LONGER else 1.0
         for size in parallel_loops.BATCH_SIZES:
             case = parallel_loops.case_name(kind, size)
@@ -186,7 +188,8 @@ def _pipes() -> Iterator[Budget]:
 
 
 def _vector() -> Iterator[Budget]:
-    """As issue 11 asks; where it says not how many environments, these are as many as CartPoles."""
+    """Return the budgets of issue 11; where it names no number of environments, the number of
+    CartPoles."""
 
     def budget(what: str, case: str, bound: float, **more: Any) -> Budget:
         rate = vector.RATE.name
@@ -276,7 +279,7 @@ def _remote() -> Iterator[Budget]:
 
 
 def _endings() -> Iterator[Budget]:
-    """The bounds are promises to users; a test would fail for them on a busy machine."""
+    """Return the bounds that users are promised; a test would fail on a busy machine."""
     bounds = {
         endings.TERMINATE: 1.0,
         endings.KILLED_PROCESS: 0.5,
@@ -291,7 +294,8 @@ def _endings() -> Iterator[Budget]:
 
 
 def _large(contender: str, where: str) -> Iterator[Budget]:
-    """A large message keeps up with a fast network, and a small task hardly waits for it."""
+    """Return the bounds of large messages: they keep up with a fast network, and small tasks hardly
+    wait."""
     for case in large_messages.CASES:
         for metric, bound, at_least in (
             (large_messages.RATE, 300e6, True),
@@ -339,7 +343,7 @@ def _on_pods() -> Iterator[Budget]:
     yield budget(what, "latency", latency.NAME, latency.P50, 3)
     for case in throughput.ARRAY_KINDS:
         yield budget(case, "throughput", case, throughput.TIME, 1)
-    # As of processes of one machine: slow pods hold up nobody.
+    # As for processes of one machine: slow pods delay no other pod.
     case, waiting = vector.uneven(64, first_ready=True), vector.uneven(64)
     what = "uneven steps of 64 environments, first ready to waiting for all"
     yield budget(what, "vector", case, vector.RATE, 1.5, at_least=True, to_case=waiting)

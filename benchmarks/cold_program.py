@@ -1,7 +1,7 @@
-"""The program that `coldstart` starts: a pool, its first map, and the moments of both.
+"""Program that `coldstart` starts: a pool, its first map, and the moments of both.
 
 Run as a file, as a user's program is: `python cold_program.py CONTENDER WORKERS NAMED_PIPE`. It
-imports nothing that the measure would then count, and ends when its standard input does.
+imports no module that the measure would then count, and ends when its standard input does.
 """
 
 import os
@@ -10,7 +10,7 @@ import time
 
 
 def stamp(path: str, what: str = "worker") -> None:
-    """Tell whoever reads the named pipe what is there now. The clock is the machine's own."""
+    """Write to the reader of the named pipe that this moment has come, by the machine's clock."""
     fd = os.open(path, os.O_WRONLY)
     os.write(fd, f"{what} {time.monotonic_ns()}\n".encode())
     os.close(fd)
@@ -22,7 +22,7 @@ def no_op(item: int) -> int:
 
 
 def main(contender: str, workers: int, path: str) -> None:
-    """What a user's program does first."""
+    """Do what a user's program does first."""
     if contender.startswith("fiber"):
         import fiber as mp
     else:

@@ -22,13 +22,13 @@ if TYPE_CHECKING:
 
 TITLE = "Cold start"
 ABOUT = """\
-A program of its own, started as a user starts one: `python program.py`. It imports the library,
+A separate program, started as a user starts one: `python program.py`. It imports the library,
 makes `Pool(n)` with an initializer, and maps a no-op over n items in default chunks. Times count
-from the moment at which the interpreter is started, so its own start is contained.
+from the moment at which the interpreter is started, so they include its start.
 Ready: the last of the n workers has run its initializer. First map: `map` has returned. The value
-of a round is the median of its programs. Bytecode is cached, but for the last case, in which no
-module of anybody has any, the standard library's neither: what a first run on a new machine may
-be like. `import fiber` alone is on the page [Start-up](startup.md)."""
+of a round is the median of its programs. Bytecode is cached, except in the last case. There no
+module has any, not even the standard library's, as in a first run on a new machine. `import fiber`
+alone is on the page [Start-up](startup.md)."""
 
 READY = Metric("ready", "workers ready", "s")
 MAP = Metric("map", "first map", "s")
@@ -40,13 +40,13 @@ Stamps = list[tuple[str, int]]
 
 
 def case_name(workers: int, *, cached: bool = True) -> str:
-    """The name of the case with so many workers."""
+    """Return the name of the case with so many workers."""
     name = f"{workers} worker{'s' if workers > 1 else ''}"
     return name if cached else f"{name}, no cached bytecode"
 
 
 def cases(size: float) -> list[Case]:
-    """The full measure at size 1; below, fewer programs."""
+    """Return the full measure at size 1; below, fewer programs."""
     return [
         Case(
             measure="coldstart",
@@ -66,7 +66,7 @@ def cases(size: float) -> list[Case]:
 
 
 def run(bench: Bench, workers: int, cached: bool, programs: int) -> dict[str, float]:
-    """The median times over so many programs, after one that leaves its bytecode behind."""
+    """Return the median times over so many programs, after one that writes the bytecode."""
     times = []
     with _bytecode_folder(writable=cached) as environment:
         if cached:
@@ -78,9 +78,9 @@ def run(bench: Bench, workers: int, cached: bool, programs: int) -> dict[str, fl
 
 @contextmanager
 def _bytecode_folder(*, writable: bool) -> Iterator[dict[str, str]]:
-    """An environment in which only that bytecode is found that was left there, if it may be.
+    """Return an environment in which only the cached bytecode of `folder` is found, if any may be.
 
-    Whatever the machine has cached, or forbids to cache, is the same for all contenders then.
+    All contenders then have the same cache, regardless of the machine's settings.
     """
     with tempfile.TemporaryDirectory() as folder:
         forbidden = "" if writable else "1"
@@ -107,8 +107,8 @@ def _times_of_one(contender: str, workers: int, environment: Mapping[str, str]) 
 
 
 def times_from(begin: int, stamps: Sequence[tuple[str, int]]) -> dict[str, float]:
-    """Seconds from `begin` to the last worker and to the end of the map; all in nanoseconds."""
-    moments = dict(sorted(stamps, key=lambda stamp: stamp[1]))  # the last of each kind remains
+    """Return nanoseconds from `begin` to the last worker and to the end of the map."""
+    moments = dict(sorted(stamps, key=lambda stamp: stamp[1]))  # the last line of each kind wins
     return {
         READY.name: (moments["worker"] - begin) / 1e9,
         MAP.name: (moments["map"] - begin) / 1e9,

@@ -1,4 +1,4 @@
-"""The command line: choose, run, report."""
+"""Command line: choose, run, report."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _QUICK_SIZE = 0.02
 
 
 def main(arguments: Sequence[str]) -> int:
-    """0 if Fiber, where it took part, got through every case; 1 if not; 130 after Ctrl-C."""
+    """Return 0 if Fiber, where it took part, got through every case; 1 if not; 130 after Ctrl-C."""
     options = _parse(arguments)
     contenders = [BY_NAME[name] for name in options.contenders]
     able, skipped = _able(contenders)
@@ -29,7 +29,7 @@ def main(arguments: Sequence[str]) -> int:
     runs = {name: Run(dict(about)) for name in options.measure}
     cases = [case for name in options.measure for case in MEASURES[name].cases(options.size)]
     for name in {case.baseline for case in cases} - {each.name for each in able}:
-        say(f"without {name} there are no ratios to it")
+        say(f"without {name} the pages have no ratios to it")
     processes.adopt_orphans()
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with scratch_folder() as scratch:
@@ -64,21 +64,21 @@ def _parse(arguments: Sequence[str]) -> argparse.Namespace:
         choices=list(MEASURES),
         default=list(MEASURES),
         metavar="NAME",
-        help=f"any of {', '.join(MEASURES)}; all if not given",
+        help=f"any of {', '.join(MEASURES)}; default: all",
     )
     parser.add_argument(
         "--contenders",
         type=_names,
         default=[each.name for each in ALL],
         metavar="A,B",
-        help=f"any of {','.join(BY_NAME)}; all that are installed if not given",
+        help=f"any of {','.join(BY_NAME)}; default: all that are installed",
     )
     parser.add_argument("--rounds", type=_count, help=f"default {_ROUNDS}; 1 with --quick")
     parser.add_argument("--size", type=_share, help="share of the full amount of work, default 1")
     parser.add_argument(
         "--quick",
         action="store_true",
-        help=f"one round at size {_QUICK_SIZE}, written to build/benchmarks: does everything work?",
+        help=f"one round at size {_QUICK_SIZE}, written to build/benchmarks, as a trial",
     )
     parser.add_argument("--output", type=Path, help="folder to write to, default docs/benchmarks")
     options = parser.parse_args(arguments)

@@ -1,8 +1,8 @@
-"""The process that stands for one contender: `python -m benchmarks.contender NAME`.
+"""Process that stands for one contender: `python -m benchmarks.contender NAME`.
 
-It reads one JSON object a line, runs the named measure, and answers with one line, until its
-input ends. Measures of different contenders so never share an interpreter, and a contender
-that hangs can be killed.
+It reads one JSON object a line, runs the named measure, and answers with one line, until its input
+ends. So measures of different contenders never share an interpreter, and a contender that hangs can
+be killed.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def give_back(item: Any) -> Any:
 
 
 class Bench:
-    """What a measure is run with."""
+    """Contender's pool and context, with which a measure runs."""
 
     of_main = staticmethod(give_back)
 
@@ -36,14 +36,14 @@ class Bench:
 
     @cached_property
     def pool(self) -> peers.Adapter:
-        """A warm pool of five workers that lives as long as this process."""
+        """Warm pool of five workers that lives as long as this process."""
         pool = peers.start(self.contender)
         pool.map(no_op, range(200), None)
         return pool
 
     @cached_property
     def processes(self) -> Any:
-        """What has the contender's Process, Pipe and Pool."""
+        """Namespace with the contender's Process, Pipe and Pool."""
         return peers.processes_of(self.contender)
 
     def close(self) -> None:
@@ -53,7 +53,7 @@ class Bench:
 
 
 def main(contender: str, kind: str) -> None:
-    """Serve until standard input ends; the pool is closed in any case."""
+    """Serve until standard input ends, and close the pool in any case."""
     requests, replies = _private_streams()
     bench = Bench(contender, light=kind == "light")
     try:
@@ -65,7 +65,7 @@ def main(contender: str, kind: str) -> None:
 
 
 def _private_streams() -> tuple[TextIO, TextIO]:
-    """Standard input and output, out of reach of libraries that print and of their children."""
+    """Return standard input and output, which libraries and their children cannot reach."""
     requests, replies = os.fdopen(os.dup(0)), os.fdopen(os.dup(1), "w")
     null = os.open(os.devnull, os.O_RDONLY)
     os.dup2(null, 0)
@@ -80,7 +80,7 @@ def _answer(bench: Bench, request: dict[str, Any]) -> dict[str, Any]:
     try:
         return {"values": measure.run(bench, **request["params"])}
     except Exception as error:
-        # Whatever a contender throws is its result for this case; the run goes on with the others.
+        # Any exception of a contender is its result for this case; the run goes on with the others.
         traceback.print_exc()
         words = str(error).strip().splitlines() or ["no message"]
         return {"error": f"{type(error).__name__}: {words[0]}"}

@@ -1,4 +1,4 @@
-"""Who takes part, what each can do, and how it is drawn. Imports none of them."""
+"""Contenders: their names, abilities and style in pictures. Imports none of their libraries."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _AGAINST_BASELINE = frozenset({"placed pipes", "agents", "import"})
 
 @dataclass(frozen=True)
 class Contender:
-    """A library in one configuration.
+    """Library in one configuration.
 
-    `servers`: it keeps servers that use the processor even when idle, so it is started for its
-    turn only, takes part in fewer rounds and gets a tenth of the no-op tasks.
-    `by_name`: packages that it imports and does not use here. Where one is not installed, a
-    stand-in that has every name takes its place.
+    `servers`: it keeps servers that use the processor even when idle. So it is started for its turn
+    only, takes part in fewer rounds and gets a tenth of the no-op tasks. `by_name`: packages that
+    it imports and does not use here. If one is not installed, a stand-in that has every name takes
+    its place.
     """
 
     name: str
@@ -40,11 +40,11 @@ class Contender:
     by_name: tuple[str, ...] = ()
 
     def needs_stand_in(self) -> bool:
-        """Whether something is not installed that it only imports."""
+        """Tell whether a package is missing that the contender only imports."""
         return not all(_found(name) for name in self.by_name)
 
     def missing(self) -> str:
-        """What must be installed before it can take part; empty if nothing."""
+        """Return what must be installed before the contender can take part; empty if nothing."""
         wanting = [name for name in self.modules if not _found(name)]
         if self.program and not shutil.which(self.program):
             wanting.append(self.program)
@@ -55,11 +55,11 @@ def _found(module: str) -> bool:
     try:
         return importlib.util.find_spec(module) is not None
     except ModuleNotFoundError:
-        # It would be part of a package that is not there.
+        # The package that would contain it is missing.
         return False
 
 
-# Colours: Okabe and Ito's set, told apart by colour-blind readers, and Tol's wine.
+# Colours: Okabe and Ito's set, which colour-blind readers can tell apart, and Tol's wine.
 ALL = (
     Contender(
         "fiber",
@@ -203,6 +203,6 @@ EXECUTOR_ON_PODS = Contender(
     "v",
     environment={"FIBER_BACKEND": "kubernetes"},
 )
-"""Both take part where a cluster is: see kubernetes_run.py."""
+"""Contenders that take part where a cluster is: see kubernetes_run.py."""
 
 BY_NAME = {contender.name: contender for contender in (*ALL, ON_PODS, EXECUTOR_ON_PODS)}

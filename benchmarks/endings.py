@@ -1,4 +1,4 @@
-"""Endings: how soon pools, tasks and programs end when they are told to, or are killed."""
+"""Endings: how soon pools, tasks and programs end when they are asked to, or are killed."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ if TYPE_CHECKING:
 
 TITLE = "Endings"
 ABOUT = """\
-How long it takes until something has ended. Terminate: `terminate` and `join` of a pool of two
-workers that sleep, with 10,000 tasks queued. Killed process: from SIGKILL to the moment at which
-its sentinel is ready in the parent. Task over its limit: what `apply(timeout=0.3)` takes beyond
-0.3 s, when the task sleeps; multiprocessing has no such limit. Ctrl-C: from SIGINT to the whole
-group of a program that waits for a `map` over two workers, until no process of it is left. Killed
-program: the same, where the program alone gets SIGKILL. Nothing ends multiprocessing's workers
-then: it does not take part in this case."""
+How long endings take. Terminate: `terminate` and `join` of a pool of two workers that sleep, with
+10,000 tasks queued. Killed process: from SIGKILL until its sentinel is ready in the parent. Task
+over its limit: the time that `apply(timeout=0.3)` takes beyond 0.3 s, when the task sleeps;
+multiprocessing has no such limit. Ctrl-C: from SIGINT to the whole process group of a program that
+waits for a `map` over two workers, until none of its processes is left. Killed program: the same,
+but only the program gets SIGKILL. multiprocessing's workers live on then, so it does not take part
+in this case."""
 
 TIME = Metric("time", "time to end", "s")
 TERMINATE = "terminate"
@@ -42,7 +42,7 @@ _PAUSE = 0.002
 
 
 def cases(size: float) -> list[Case]:
-    """All endings; the size makes no difference."""
+    """Return all endings; the size makes no difference."""
     return [
         Case(
             measure="endings",

@@ -1,4 +1,4 @@
-"""The program that `endings` ends: a pool whose workers sleep while the program waits.
+"""Program that `endings` ends: a pool whose workers sleep while the program waits.
 
 Run as a file, as a user's program is: `python endless_program.py CONTENDER`.
 """

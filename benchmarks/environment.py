@@ -1,6 +1,5 @@
-"""Environments that cost as much as is wanted: nothing, so that a vector step shows the cost of the
-links alone, or time, or a large observation.
-"""
+"""Environments with a chosen cost: none, so that a step shows the cost of the links alone, or time,
+or a large observation."""
 
 from __future__ import annotations
 
@@ -12,7 +11,7 @@ import numpy as np
 
 
 class Still(gymnasium.Env[Any, Any]):
-    """Four numbers that never change."""
+    """Environment whose four numbers never change."""
 
     observation_space = gymnasium.spaces.Box(-1, 1, (4,), np.float32)
     action_space = gymnasium.spaces.Discrete(2)
@@ -28,30 +27,30 @@ class Still(gymnasium.Env[Any, Any]):
         return self.observation, {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """The same observation, no reward, no end."""
+        """Return the same observation, no reward, no end."""
         return self.observation, 0.0, False, False, {}
 
 
 class Sleeping(Still):
-    """A step takes a millisecond, and no processor."""
+    """Environment whose step takes a millisecond, and no processor."""
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """As that of `Still`, a moment later."""
+        """Step as `Still` does, a millisecond later."""
         time.sleep(0.001)
         return super().step(action)
 
 
 class Uneven(Still):
-    """One step in ten takes five milliseconds, the others a tenth of one."""
+    """Environment with one step in ten of five milliseconds, the others of a tenth of one."""
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """As that of `Still`, sooner or later."""
+        """Step as `Still` does, after the time of this step."""
         time.sleep(0.005 if self.np_random.random() < 0.1 else 0.0001)
         return super().step(action)
 
 
 class Pixels(gymnasium.Env[Any, Any]):
-    """Four frames of an Atari game, each time another picture."""
+    """Environment with four frames of an Atari game, each time another picture."""
 
     observation_space = gymnasium.spaces.Box(0, 255, (84, 84, 4), np.uint8)
     action_space = gymnasium.spaces.Discrete(2)
@@ -73,5 +72,5 @@ class Pixels(gymnasium.Env[Any, Any]):
 
 
 def cart_pole() -> gymnasium.Env[Any, Any]:
-    """The real one."""
+    """Gymnasium's CartPole."""
     return gymnasium.make("CartPole-v1")

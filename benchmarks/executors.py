@@ -15,12 +15,12 @@ if TYPE_CHECKING:
 
 TITLE = "Executors"
 ABOUT = f"""\
-{WORKERS} workers of a concurrent.futures.Executor, each in its own library's executor; loky's is
-the one within joblib. Tasks give their argument, an int, back, at once or after a sleep of a
-millisecond. `submit` is one call for each task, and then all results; `map` has chunksize 1 if not
-said otherwise. Dask's are `Client.submit` and `Client.map`, which have no chunks, and Ray's
-`apply_async` and `map` of its Pool: both get a tenth of the no-op tasks. The value of a round is
-the median of up to five batches in a row."""
+{WORKERS} workers of a concurrent.futures.Executor, each library with its own executor; loky is the
+one within joblib. Tasks return their argument, an int, at once or after a sleep of a millisecond.
+`submit` is one call for each task, and then all results. `map` has chunksize 1 unless the case says
+otherwise. Dask has `Client.submit` and `Client.map`, which have no chunks, and Ray `apply_async`
+and `map` of its Pool. Both get a tenth of the no-op tasks. The value of a round is the median of up
+to five batches in a row."""
 
 RATE = Metric("rate", "tasks a second", "1/s")
 BASELINE = "concurrent.futures"
@@ -30,7 +30,7 @@ IN_CHUNKS = "map, no-ops, chunksize 100"
 SLEEPING = "submit, 1 ms tasks"
 _CHUNKS = "executor in chunks"
 
-# Name, what it needs, chunk size (0: submit), seconds of a task, tasks.
+# Name, ability, chunk size (0: submit), seconds of a task, tasks.
 _CASES = (
     (SUBMIT, "executor", 0, 0.0, 5_000),
     (MAP, "executor", 1, 0.0, 5_000),
@@ -40,7 +40,7 @@ _CASES = (
 
 
 def cases(size: float) -> list[Case]:
-    """The full measure at size 1; below, fewer tasks."""
+    """Return the full measure at size 1; below, fewer tasks."""
     return [
         Case(
             measure="executors",
@@ -61,7 +61,7 @@ def cases(size: float) -> list[Case]:
 
 
 def run(bench: Bench, chunksize: int, seconds: float, tasks: int) -> dict[str, float]:
-    """Tasks a second."""
+    """Return tasks a second."""
     function = partial(after, seconds) if seconds else no_op
 
     def batch(count: int) -> Iterable[Any]:

@@ -1,9 +1,9 @@
-"""Agents and workers that are not processes, for what only their number shows.
+"""Agents and workers that are not processes, to measure what depends on their number only.
 
-A `FakeAgent` is an `AgentHandle` whose children live in the process of the agent itself: what the
-master does for them, and what travels to and from them, is as ever, but they cost next to nothing.
-They run their tasks, by the code of a real worker, one after the other on the loop's thread.
-This is the one module that knows Fiber's inner parts, with `agent_host` and `fake_cluster`.
+A `FakeAgent` is an `AgentHandle` whose children live in the process of the agent itself. The
+master's work for them, and the messages to and from them, are real, but the children cost next to
+nothing. They run their tasks by the code of a real worker, one after the other on the loop's
+thread. Only this module, `agent_host` and `fake_cluster` know Fiber's inner parts.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from fiber._wire.packet import Message
 _READY = pickle.dumps((work.READY,))
 _BOARD = 16
 _BIRTH = 0.01
-"""Seconds until a child is there, about those of a real one: no process is ready before the call
+"""Seconds until a child is ready, about those of a real one: no process is ready before the call
 that starts it has returned, and the master need not be quick about one that is."""
 
 
 class FakeBackend:
-    """A `Backend` of one fake agent in this process."""
+    """`Backend` of one fake agent in this process."""
 
     name = "fake"
     same_host = True
@@ -40,15 +40,15 @@ class FakeBackend:
         self._agent = agent
 
     def child(self, spec: ChildSpec, observer: ChildObserver) -> Any:
-        """A child of the one agent."""
+        """Return a child of the one agent."""
         return self._agent.child(spec, observer)
 
     def close(self) -> None:
-        """Nothing is left behind by objects."""
+        """Do nothing: objects leave nothing behind."""
 
 
 class FakeAgent:
-    """An agent whose children are objects. `on_ready` is called for each that is ready."""
+    """Agent whose children are objects. It calls `on_ready` for each child that is ready."""
 
     def __init__(
         self,
@@ -64,15 +64,15 @@ class FakeAgent:
         self._numbers = itertools.count(1)
 
     def child(self, spec: ChildSpec, observer: ChildObserver) -> FakeChild:
-        """A child, which is ready soon after it is started."""
+        """Return a child, which is ready soon after it is started."""
         return FakeChild(self, spec.name, next(self._numbers), observer)
 
     def close(self) -> None:
-        """Nothing is left behind by objects."""
+        """Do nothing: objects leave nothing behind."""
 
 
 class FakeChild:
-    """A `ChildHandle` of a pool worker."""
+    """`ChildHandle` of a pool worker."""
 
     def __init__(self, agent: FakeAgent, name: str, number: int, observer: ChildObserver) -> None:
         self.name = name
@@ -87,11 +87,12 @@ class FakeChild:
         self._gone = False
 
     def start(self) -> None:
-        """It will be there."""
+        """Do nothing: the child will be ready by itself."""
         self._agent.loop.call_later(_BIRTH, self.begin)
 
     def begin(self) -> None:
-        """It is there, and ready, if it lives. On the loop's thread, as all that follows of it."""
+        """Report that the child is ready, if it lives. Runs on the loop's thread, as all that
+        follows."""
         if self._gone:
             return
         self.pid = self._number
@@ -105,21 +106,21 @@ class FakeChild:
         return True
 
     def lend(self) -> None:
-        """Its answers are the loop's to bring."""
+        """Do nothing: the loop brings the answers."""
 
     def reclaim(self) -> None:
-        """It is never lent."""
+        """Return None: this worker is never leased."""
 
     def recall(self) -> None:
-        """What was delivered it has run by now, or is just about to."""
+        """Return no tasks: the worker has run what was delivered, or is about to."""
         self._agent.loop.call_soon(self._observer.recalled, [])
 
     def signal(self, signum: int) -> None:
-        """Die of it."""
+        """End the child by the signal."""
         self._agent.loop.call_soon(self._end, ExitReport(-signum, "killed"))
 
     def send(self, payload: bytes, buffers: Sequence[memoryview] = ()) -> None:
-        """What its worker says goes to its observer: a worker's `Sender`."""
+        """Give the worker's packets to its observer: a worker's `Sender`."""
         self._observer.received(Message(memoryview(payload), list(buffers), []))
 
     def _run(self, payload: bytes, buffers: list[memoryview]) -> None:
@@ -135,9 +136,9 @@ class FakeChild:
 
 
 class TaskRunner:
-    """One real worker that runs what all fake children of a process have to run, each in turn.
+    """Real worker that runs the tasks of all fake children of a process, one child after the other.
 
-    One for all, as a worker may start a thread that watches over long batches.
+    One serves all, because a worker may start a thread that watches over long batches.
     """
 
     def __init__(self) -> None:
@@ -145,11 +146,11 @@ class TaskRunner:
         self._worker = Worker(self, memoryview(bytearray(_BOARD)).cast("Q"))
 
     def run(self, child: FakeChild, message: Message) -> bool:
-        """Run and answer for this child; False if it was told to stop."""
+        """Run and answer for this child; False if it was asked to stop."""
         self._child = child
         return self._worker.handle(message)
 
     def send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
-        """The worker's answer is that of the child whose turn it is."""
+        """Send the worker's answer as that of the child whose turn it is."""
         assert self._child is not None
         self._child.send(bytes(payload), buffers)

@@ -1,4 +1,4 @@
-"""The master's side of many fake agents: a backend whose agents have real links."""
+"""Master's side of many fake agents: a backend whose agents have real links."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from fiber._transport.link import Link
 from fiber._transport.listener import MasterListener
 
 HOSTS = 4
-"""Processes among which the agents are shared out."""
+"""Processes that share the agents."""
 
 _PATIENCE = 60.0
 _END = 10.0
@@ -37,10 +37,10 @@ Host: TypeAlias = subprocess.Popen[str]
 
 
 class FakeCluster:
-    """A `Backend` whose agents live in `hosts`.
+    """`Backend` whose agents live in `hosts`.
 
-    `joined` are the seconds that it took all agents to join, from the order to dial, and `joining`
-    those of a processor that this process used meanwhile; `master_memory` and `agent_memory` the
+    `joined` is the seconds that all agents took to join, from the order to dial. `joining` is the
+    processor time that this process used meanwhile. `master_memory` and `agent_memory` are the
     bytes that a link costs either side, as PSS.
     """
 
@@ -74,7 +74,7 @@ class FakeCluster:
         self.joined = self.joining = self.master_memory = self.agent_memory = 0.0
 
     def join(self) -> None:
-        """Have all agents dial, and wait until the last of them has its link."""
+        """Let all agents dial, and wait until the last of them has its link."""
         names = self._names
         before = self._memory()
         begin, used = time.perf_counter(), time.process_time()
@@ -104,11 +104,11 @@ class FakeCluster:
             raise RuntimeError(self._problem)
 
     def child(self, spec: ChildSpec, observer: ChildObserver) -> RemoteChild:
-        """A child of the agent that has the fewest."""
+        """Return a child of the agent that has the fewest."""
         return self._agents.child(spec, observer)
 
     def close(self) -> None:
-        """End the agents, and with them their hosts; those that never began do not matter."""
+        """End the agents, and with them their hosts; hosts that never began do not matter."""
         self._loop.call_soon(self._close_agents)
         for host in self._hosts:
             with suppress(subprocess.TimeoutExpired):
@@ -119,10 +119,10 @@ class FakeCluster:
         self._output.close()
 
     def _memory(self) -> tuple[int, int]:
-        """Of this process, and of the hosts together."""
+        """Return the memory of this process, and of the hosts together."""
         return processes.pss(os.getpid()), sum(processes.pss(host.pid) for host in self._hosts)
 
-    # On the loop's thread
+    # Runs on the loop's thread.
 
     def _link(self, link: Link) -> None:
         self._agents.join(link.peer.name, link)
@@ -145,7 +145,7 @@ class FakeCluster:
 
 @contextmanager
 def agent_hosts(count: int = HOSTS) -> Iterator[list[Host]]:
-    """Processes that have imported all that they need and wait for their orders."""
+    """Return processes that have imported all that they need and wait for their orders."""
     with ExitStack() as stack:
         hosts = [stack.enter_context(_host()) for _ in range(count)]
         for host in hosts:

@@ -1,4 +1,4 @@
-"""One picture for each measure, with the same colour and marker for a contender in all of them."""
+"""Pictures: one for each measure, with the same colour and marker for a contender in all."""
 
 from __future__ import annotations
 
@@ -259,7 +259,8 @@ DRAW: Mapping[str, Callable[[Run, Path], None]] = {
 
 
 def _lines(panel: Any, run: Run, points: Points, metric: Metric, *, log_x: bool = True) -> None:
-    """A line for each contender, whose bars go from the least to the greatest of the rounds."""
+    """Draw a line for each contender, whose bars reach from the least to the greatest of the
+    rounds."""
     for name, contender in BY_NAME.items():
         found = [(x, value) for x, case in points if (value := _found(run, case, name, metric))]
         style = {"color": contender.colour, "marker": contender.marker, "label": contender.label}
@@ -274,7 +275,7 @@ def _lines(panel: Any, run: Run, points: Points, metric: Metric, *, log_x: bool 
             )
         for x, case in points:
             if name in (failed := list(run.failures.get(case, {}))):
-                # Side by side along the top, as several may fail at the same point.
+                # Side by side along the top, because several may fail at the same point.
                 panel.annotate(
                     "✗",
                     (x, 0.96),
@@ -286,7 +287,7 @@ def _lines(panel: Any, run: Run, points: Points, metric: Metric, *, log_x: bool 
                     horizontalalignment="center",
                 )
     if not panel.lines:
-        return  # nobody took part, and an axis without values has no logarithms
+        return  # no values: a logarithmic axis needs some
     panel.margins(y=0.12)
     if log_x:
         panel.set_xscale("log")
@@ -296,7 +297,7 @@ def _lines(panel: Any, run: Run, points: Points, metric: Metric, *, log_x: bool 
 
 
 def _rows(panel: Any, run: Run, cases: Sequence[str], metric: Metric) -> None:
-    """A row for each case with a marker for each contender."""
+    """Draw a row for each case with a marker for each contender."""
     for name, contender in BY_NAME.items():
         found = [
             (row, value)
@@ -304,7 +305,7 @@ def _rows(panel: Any, run: Run, cases: Sequence[str], metric: Metric) -> None:
             if (value := _found(run, case, name, metric))
         ]
         if found:
-            # Fiber's own on top, where markers meet.
+            # Fiber's marker on top, where markers meet.
             panel.errorbar(
                 [value.median for _, value in found],
                 [row for row, _ in found],
@@ -340,7 +341,7 @@ def _unit(axis: Any, unit: str, ticks: Sequence[float] | None = None) -> None:
     if ticks:
         axis.set_ticks(ticks)
     elif high < _NARROW * low:
-        # A decade or two alone would leave one or no number on the axis.
+        # Ticks at decades alone would leave one number or none on an axis of a decade or two.
         axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axis.set_major_formatter(FuncFormatter(lambda value, _: _short(value, unit)))
     axis.set_minor_formatter(NullFormatter())
@@ -352,7 +353,7 @@ def _counts(axis: Any) -> None:
 
 
 def _short(value: float, unit: str) -> str:
-    """A tick: "1 ms", "10,000"."""
+    """Return a tick: "1 ms", "10,000"."""
     number, _, name = in_words(value, unit).partition(" ")
     short = number.rstrip("0").rstrip(".") if "." in number else number
     return short if unit == "1/s" else f"{short} {name}"

@@ -1,8 +1,8 @@
-"""The cluster of tests/cluster with all that kubernetes_run needs, while that measures.
+"""Cluster of tests/cluster with all that kubernetes_run needs, while that measures.
 
-`python -m benchmarks.kubernetes_cluster` passes its arguments on. What was there before is used and
-stays; what was made here goes at the end. The run is a process of its own: it ends all processes
-below it, and the cluster must not be among them.
+`python -m benchmarks.kubernetes_cluster` passes its arguments on. Parts that existed before are
+used and stay; parts that are made here are removed at the end. The run is a separate process: it
+ends all processes below it, and the cluster must not be among them.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _TROUBLE = (CannotMeasure, ClusterError, Failed, Refused, OSError, AssertionErro
 
 
 def main(arguments: Sequence[str]) -> int:
-    """The run's exit status; 1 where no cluster can be made ready."""
+    """Return the run's exit status; 1 if no cluster can be made ready."""
     command = [sys.executable, "-m", "benchmarks.kubernetes_run", *arguments]
     try:
         with _place() as variables, subprocess.Popen(command, env=os.environ | variables) as run:
@@ -39,7 +39,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _wait_for(run: subprocess.Popen[bytes]) -> int:
-    """Its exit status. Ctrl-C, which a terminal sends to both, is the run's to answer."""
+    """Run it and return its exit status. A terminal sends Ctrl-C to both; the run answers it."""
     while True:
         try:
             return run.wait()
@@ -49,7 +49,7 @@ def _wait_for(run: subprocess.Popen[bytes]) -> int:
 
 @contextlib.contextmanager
 def _place() -> Iterator[dict[str, str]]:
-    """Where pods are made, as variables for Fiber."""
+    """Return where pods are made, as variables for Fiber."""
     with contextlib.ExitStack() as stack:
         kubeconfig = stack.enter_context(preparation.own_cluster(0))
         kube = stack.enter_context(open_api(kubeconfig))

@@ -23,20 +23,20 @@ ABOUT = f"""\
 A generation as in examples/02-es: a policy's {PARAMETERS:,} parameters go out with {EPISODES}
 episodes for each worker, results come back in any order, one by one, and move the parameters. An
 episode sleeps for {EPISODE * 1000:g} ms in place of a simulator, so that one machine has room for
-all workers: without any overhead there are {1 / (EPISODE * EPISODES):g} generations a second. Pods
-run {PROCESSES_PER_POD} workers each here."""
+all workers. Without overhead there are {1 / (EPISODE * EPISODES):g} generations a second. Here a
+pod runs {PROCESSES_PER_POD} workers."""
 
 RATE = Metric("rate", "generations a second", "1/s")
 WORKERS = (8, 40, 200)
 
 
 def workers(count: int) -> str:
-    """The name of the case with so many workers."""
+    """Return the name of the case with so many workers."""
     return f"{count} workers"
 
 
 def cases(size: float) -> list[Case]:
-    """The full measure at size 1; below, fewer generations."""
+    """Return the full measure at size 1; below, fewer generations."""
     return [
         Case(
             measure="kubernetes_es",
@@ -53,7 +53,7 @@ def cases(size: float) -> list[Case]:
 
 
 def run(bench: Bench, workers: int, generations: int) -> dict[str, float]:
-    """Generations a second, after one that all workers are started by."""
+    """Return generations a second, after one that starts all workers."""
     import numpy as np
 
     if bench.contender == "fiber-kubernetes":
@@ -80,6 +80,6 @@ def _generation(pool: peers.Adapter, theta: Any, workers: int) -> float:
 
 
 def episode(theta: Any, seed: int) -> float:
-    """What a worker does: nothing, for as long as an episode takes."""
+    """Do what a worker does: sleep as long as an episode takes."""
     time.sleep(EPISODE)
     return float(theta[seed % len(theta)]) + 1e-3 * (seed % 7)

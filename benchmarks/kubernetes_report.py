@@ -1,4 +1,4 @@
-"""The page about pods: one for all of its measures, with their budgets above."""
+"""Page about pods: one for all of its measures, with their budgets above."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ MEASURES: dict[str, ModuleType] = {
 }
 PAGE, PICTURE, RESULTS = "kubernetes.md", "kubernetes.png", "kubernetes.json"
 NOTES = "kubernetes-notes.md"
-"""By hand."""
+"""Page that is written by hand."""
 _OF_ONE_HOST = {
     "throughput": ("map, chunksize 1", "map, default chunks", *throughput.ARRAY_KINDS),
     "executors": (executors.SUBMIT, executors.MAP, executors.SLEEPING),
@@ -46,18 +46,18 @@ _OF_ONE_HOST = {
         *(vector.uneven(64, first_ready=first) for first in (False, True)),
     ),
 }
-"""Of measures that have more cases: those that say something of pods."""
+"""Cases that tell something about pods, for measures that have more."""
 _ABOUT = """\
-Fiber with its processes in pods, beside multiprocessing on the same machine and beside Ray's and
-Dask's own clusters of as many workers as processes on it. Vector environments and executors are
-beside Fiber's own, and Gymnasium's or concurrent.futures', with processes of this machine. The
-program runs outside of the cluster, and each pod of Fiber's has one worker, if not said otherwise.
-Every pod is on this machine: what
-differs from one host is the way, through Kubernetes' network, encrypted, and not the distance."""
+Fiber with its processes in pods. It is compared with multiprocessing on the same machine, and with
+Ray's and Dask's clusters of as many workers, which are processes of it. Vector environments and
+executors are compared with Fiber's, Gymnasium's or concurrent.futures' on processes of this
+machine. The program runs outside the cluster. Each pod of Fiber has one worker, unless a section
+says otherwise. Every pod is on this machine: messages pass through Kubernetes' network and are
+encrypted, but travel no distance."""
 
 
 def cases(size: float) -> list[Case]:
-    """What is measured."""
+    """Return the cases that are measured."""
     return [
         case
         for name, measure in MEASURES.items()
@@ -67,7 +67,7 @@ def cases(size: float) -> list[Case]:
 
 
 def write(folder: Path, runs: Mapping[str, Run]) -> None:
-    """The results, the page and the picture."""
+    """Write the results, the page and the picture."""
     folder.mkdir(parents=True, exist_ok=True)
     data = {name: run.as_json() for name, run in runs.items()}
     (folder / RESULTS).write_text(json.dumps(data, separators=(",", ":")) + "\n", encoding="utf-8")
@@ -77,7 +77,7 @@ def write(folder: Path, runs: Mapping[str, Run]) -> None:
 
 
 def page(runs: Mapping[str, Run], *, notes: bool = False) -> str:
-    """Every measure with a table for each of its groups."""
+    """Return the page: every measure with a table for each of its groups."""
     first = runs["overhead"]
     of_all = cases(first.about["size"])
     parts = [

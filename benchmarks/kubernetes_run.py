@@ -1,7 +1,7 @@
 """Fiber on pods beside others on processes: `python -m benchmarks.kubernetes_run`.
 
 Pods are made where Fiber's environment says: KUBECONFIG, FIBER_NAMESPACE, and FIBER_IMAGE, which
-has numpy. kubernetes_cluster.py has all of it ready first.
+has numpy. kubernetes_cluster.py prepares all of it.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _QUICK_SIZE = 0.02
 
 
 def main(arguments: Sequence[str]) -> int:
-    """0 if Fiber got through every case; 1 if not; 130 after Ctrl-C, and nothing is written."""
+    """Return 0 if Fiber got through every case; 1 if not; 130 after Ctrl-C, without a page."""
     options = _parse(arguments)
     skipped = {each.name: missing for each in CONTENDERS if (missing := each.missing())}
     for name, missing in skipped.items():

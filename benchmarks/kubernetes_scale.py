@@ -1,12 +1,12 @@
-"""What the backend kubernetes costs a master with many pods that come within seconds.
+"""Cost of the backend kubernetes for a master with many pods that come within seconds.
 
     PYTHONPATH=tests python -m benchmarks.kubernetes_scale --pods 1000
 
-The API server, the operator, the nodes and the agents are played by other processes
-(`scripted_cluster`); the master is all real.  It makes a pool of as many workers, has each work,
-ends it and lets all pods go, and prints a line of JSON for each of both halves.  `stalls` are the
-times, in milliseconds, that its loop was longest away from a timer of one millisecond, and `turns`
-the processor time of the loop's thread from one look at that timer to the next, where most.
+Other processes (`scripted_cluster`) play the API server, the operator, the nodes and the agents;
+the master is real. It makes a pool of as many workers, lets each work, ends the pool, removes all
+pods, and prints a line of JSON for each half. `stalls` are the longest times, in milliseconds, that
+its loop was away from a timer of one millisecond. `turns` are the largest processor times of the
+loop's thread from one look at that timer to the next.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _WORST = 5
 
 
 class Stalls:
-    """How long a loop is away from a timer that is due."""
+    """Watch that measures how long a loop is away from a timer that is due."""
 
     def __init__(self, loop: Any) -> None:
         self._loop = loop
@@ -48,7 +48,7 @@ class Stalls:
         loop.call_soon(self._tick, time.perf_counter())
 
     def worst(self) -> dict[str, list[float]]:
-        """Those since the last call, the longest first, in milliseconds."""
+        """Return the stalls since the last call, the longest first, in milliseconds."""
         late, self._late = self._late, []
         turns, self._turns = self._turns, []
         return {"stalls": _longest(late), "turns": _longest(turns)}
@@ -83,7 +83,7 @@ class Watched:
 
 @contextmanager
 def scripted_cluster(agents: int) -> Iterator[subprocess.Popen[str]]:
-    """The process; KUBECONFIG names it."""
+    """Cluster's process; KUBECONFIG names it."""
     command = [sys.executable, "-m", "benchmarks.scripted_cluster", str(agents)]
     with (
         tempfile.TemporaryDirectory() as folder,

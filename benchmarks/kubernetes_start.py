@@ -1,4 +1,4 @@
-"""Start on pods: until a pool's first result, where nothing is there and where pods are."""
+"""Start on pods: until a pool's first result, without pods and with running pods."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ TITLE = "Start"
 WORKERS = 8
 ABOUT = f"""\
 A pool of {WORKERS} workers, from the call that makes it until a first map of as many no-ops is
-complete. Cold: in a program that has done nothing before; for Ray and Dask the start of their own
-cluster is contained, for pods all that Kubernetes does until they run, with the image on the nodes.
+complete. Cold: in a program that has done nothing before. This includes the start of Ray's and
+Dask's clusters, and for pods all work of Kubernetes until they run, with the image on the nodes.
 Warm: a second pool of the same program, after the first was closed."""
 
 TIME = Metric("time", "first results", "s")
@@ -25,7 +25,7 @@ COLD, WARM = "cold", "warm"
 
 
 def cases(size: float) -> list[Case]:
-    """The same at every size: one pool cannot be made smaller."""
+    """Return the same at every size: one pool cannot be made smaller."""
     return [
         Case(
             measure="kubernetes_start",
@@ -42,7 +42,7 @@ def cases(size: float) -> list[Case]:
 
 
 def run(bench: Bench, warm: bool) -> dict[str, float]:
-    """Seconds to the first results of the first pool, or of the second."""
+    """Return seconds to the first results of the first pool, or of the second."""
     first = _time_of_one(bench.contender)
     return {TIME.name: _time_of_one(bench.contender) if warm else first}
 

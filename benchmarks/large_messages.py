@@ -19,9 +19,9 @@ TITLE = "Large messages"
 ABOUT = """\
 One message of so many bytes: as the argument of a task, as its result, through a `Pipe` and
 through a `Queue` from this process to another and back, of which half the time counts. All
-messages are `bytes` that were there before. Meanwhile a thread calls one no-op task after the
-other on another worker, which with loopback agents has the same agent, and so the same link. The
-time of such a task is that below which 95 % of them stayed."""
+messages are `bytes` that were made before. Meanwhile a thread calls one no-op task after the other
+on another worker. With loopback agents that worker has the same agent, and so the same link. The
+time of such a task is the 95th percentile."""
 
 RATE = Metric("rate", "bytes a second", "B/s")
 BESIDE = Metric("beside", "small task beside it, p95", "s")
@@ -29,13 +29,14 @@ WAYS = ("argument", "result", "Pipe", "Queue")
 SIZES = {"64 MB": 64 << 20, "256 MB": 256 << 20, "2 GB": 2 << 30, "4 GB": 4 << 30}
 _MANY = 1 << 30
 _NEEDED = 4
-"""Times its size: what a message takes of this machine's memory, with some left for others."""
+"""Memory that a message takes on this machine, in multiples of its size, with some left for
+others."""
 _CONTENDERS = ("fiber", "fiber-loopback", "fiber-kubernetes", "multiprocessing")
 _LIMIT = 180.0
 
 
 def case_name(size: str, way: str) -> str:
-    """The name of the case of a message of this size that goes this way."""
+    """Return the name of the case of a message of this size that goes this way."""
     return f"{size}, {way}"
 
 
@@ -43,7 +44,7 @@ CASES = [case_name(size, way) for way in WAYS for size in SIZES]
 
 
 def cases(size: float) -> list[Case]:
-    """The full measure at size 1; below, smaller messages in their places."""
+    """Return the full measure at size 1; below, smaller messages in their places."""
     memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     return [
         _case(label, way, max(1, round(nbytes * size)), memory)
@@ -69,7 +70,7 @@ def _case(label: str, way: str, nbytes: int, memory: int) -> Case:
 
 
 def run(bench: Bench, way: str, nbytes: int) -> dict[str, float]:
-    """Bytes a second of one message, and the time of small tasks beside it."""
+    """Return bytes a second of one message, and the time of small tasks beside it."""
     if bench.contender == "fiber-loopback":
         bench.processes.init(agents=1)
     elif bench.contender == "fiber-kubernetes":
@@ -116,7 +117,7 @@ def _there_and_back(processes: Any, way: str, nbytes: int, other: Any) -> tuple[
 
 
 def _timed(message: Callable[[], object], other: Any) -> tuple[float, list[float]]:
-    """Seconds that the message takes, and those of each small task beside it."""
+    """Return the seconds of the message, and those of each small task beside it."""
     over, times = threading.Event(), list[float]()
 
     def small_tasks() -> None:

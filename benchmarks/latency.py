@@ -1,4 +1,4 @@
-"""Latency: one call, waited for, again and again."""
+"""Latency: one call and its result, again and again."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ TITLE = "Latency"
 ABOUT = f"""\
 Time of one `apply` of a no-op to an idle pool of {WORKERS} workers: up to 2,000 calls, one
 after the other, or as many as fit in 2 s. The function is one of an importable module, or of the
-main module, as in most scripts. p50 is the time that half of the calls stay below,
-p95 the time that 95 % stay below. Where a library has no such call, the nearest is taken:
-submit and wait for the result; for Spark a job of one task."""
+main module, as in most scripts. Half of the calls stay below p50, and 95 % below p95. Libraries
+without such a call use the nearest one: submit, and wait for the result; for Spark a job of one
+task."""
 
 P50 = Metric("p50", "p50", "s")
 P95 = Metric("p95", "p95", "s")
@@ -27,7 +27,7 @@ OF_MAIN = "apply, function of __main__"
 
 
 def cases(size: float) -> list[Case]:
-    """The full measure at size 1; below, fewer calls."""
+    """Return the full measure at size 1; below, fewer calls."""
     params = {"calls": max(20, round(2000 * size)), "seconds": 2.0 * size}
     return [
         Case("latency", name, "one call", "apply", {**params, "of_main": of_main}, (P50, P95))
@@ -36,7 +36,7 @@ def cases(size: float) -> list[Case]:
 
 
 def run(bench: Bench, calls: int, seconds: float, of_main: bool = False) -> dict[str, float]:
-    """The percentiles of up to `calls` calls, or of as many as fit in `seconds`."""
+    """Return percentiles of up to `calls` calls, or of as many as fit in `seconds`."""
     function = bench.of_main if of_main else no_op
     for _ in range(max(5, calls // 20)):
         bench.pool.apply(function, 0)

@@ -1,7 +1,7 @@
-"""What a vector step costs at least whose observations come from other hosts: no part of a run.
+"""Least cost of a vector step whose observations come from other hosts: no part of a run.
 
 ``python -m benchmarks.link_floor`` prints how long it takes to copy the bytes of 64 observations of
-84x84x4, to seal them, to carry them over TCP on this machine, and to open them: each by itself.
+84x84x4, to seal them, to carry them over TCP on this machine, and to open them: each separately.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ PIECE = 512 * 1024
 """Bytes that are sealed at once, as on a link."""
 
 _TAG = 16
-_NONCE = bytes(12)  # nothing of this leaves the machine
+_NONCE = bytes(12)  # these bytes never leave the machine
 
 
 def measure(size: int, rounds: int) -> dict[str, float]:
-    """Milliseconds of each, medians of so many rounds."""
+    """Return milliseconds of each, medians of so many rounds."""
     data, target = memoryview(os.urandom(size)), memoryview(bytearray(size))
     cipher = AESGCM(os.urandom(32))
     pieces = [data[start : start + PIECE] for start in range(0, size, PIECE)]
@@ -53,7 +53,7 @@ def measure(size: int, rounds: int) -> dict[str, float]:
 
 
 class _Carrier:
-    """A TCP connection within this process, read by a thread."""
+    """TCP connection within this process, read by a thread."""
 
     def __init__(self, target: memoryview) -> None:
         self._target = target
@@ -72,7 +72,7 @@ class _Carrier:
         self._theirs.close()
 
     def carry(self, data: memoryview) -> None:
-        """Send it and wait until it has arrived."""
+        """Send the bytes and wait until they have arrived."""
         self._ours.sendall(data)
         self._ours.recv(1)
 

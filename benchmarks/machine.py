@@ -1,4 +1,4 @@
-"""Where and when a run was made, and what else the machine did meanwhile."""
+"""Origin of a run: where and when it was made, and how busy the machine was meanwhile."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ _COUNTED = slice(0, 8)  # without guests, whose time is in the others already
 
 
 def in_use() -> float:
-    """The share of all processors' time that was used in a fifth of a second from now.
+    """Return the share of all processors' time that was used in a fifth of a second from now.
 
-    Called when no contender works, it tells of everybody else: a machine's other guests too.
+    Called when no contender works, it measures all other programs, and the machine's other guests.
     """
     before = Path("/proc/stat").read_text(encoding="ascii")
     time.sleep(_MOMENT)
@@ -31,7 +31,8 @@ def in_use() -> float:
 
 
 def share_in_use(before: str, after: str) -> float:
-    """The share of the time between two readings of /proc/stat in which no processor was idle."""
+    """Return the share of the time between two readings of /proc/stat in which processors
+    worked."""
     first, second = (
         [int(word) for word in text.splitlines()[0].split()[1:]] for text in (before, after)
     )
@@ -42,7 +43,7 @@ def share_in_use(before: str, after: str) -> float:
 def about(
     contenders: Sequence[Contender], command: str, rounds: int, size: float
 ) -> dict[str, Any]:
-    """What stands above every table."""
+    """Return the facts that stand above every table."""
     names = [name for contender in contenders for name in contender.modules]
     return {
         "date": time.strftime("%Y-%m-%d %H:%M %Z"),
@@ -64,7 +65,7 @@ def _version(module: str) -> str:
     try:
         return importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
-        # Run from a checkout, or absent: either is said elsewhere.
+        # Run from a checkout, or no git: both are recorded elsewhere.
         return ""
 
 

@@ -1,6 +1,7 @@
-"""The words of the benchmarks.
+"""Terms of the benchmarks.
 
-A case is one thing to measure, a metric one number it gives, a run all that was measured.
+A case is one thing to measure. A metric is one number that it gives. A run is all that was
+measured.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ MANY_ROUNDS = 3
 
 @dataclass(frozen=True)
 class Metric:
-    """One number of a case. `unit` is "s", "1/s", "B" or "B/s"."""
+    """Metric of a case. `unit` is "s", "1/s", "B" or "B/s"."""
 
     name: str
     label: str
@@ -26,19 +27,18 @@ class Metric:
 
 
 def rounds_with(workers: int) -> int | None:
-    """At most so many rounds with so many workers; None if there is no such bound."""
+    """Return the most rounds with so many workers; None if there is no such bound."""
     return MANY_ROUNDS if workers >= MANY else None
 
 
 @dataclass(frozen=True)
 class Case:
-    """One thing that every able contender does once in every round.
+    """Case that every able contender does once in every round.
 
-    `limit`: seconds after which it counts as not finished and is not tried again.
-    `fresh`: needs a contender process that has done nothing before.
-    `rounds`: at most so many, however long they take.
-    `baseline`: the contender that ratios are to.
-    `not_run`: contenders that are not asked to, though they offer it, and why.
+    `limit`: seconds after which it counts as not finished and is not tried again. `fresh`: needs a
+    contender process that has done nothing before. `rounds`: at most so many, however long they
+    take. `baseline`: the contender that ratios are to. `not_run`: contenders that are left out
+    although they offer it, and why.
     """
 
     measure: str
@@ -59,10 +59,10 @@ Series = list[float | None]
 
 @dataclass
 class Run:
-    """What one run of one measure gave.
+    """Run of one measure.
 
-    For each case, contender and metric one value a round, None where there is none. `in_use`: the
-    share of the processors' time that others used in a moment before each round.
+    It has one value a round for each case, contender and metric, or None. `in_use` is the share of
+    the processors' time that other programs used in a moment before each round.
     """
 
     about: dict[str, Any]
@@ -79,20 +79,21 @@ class Run:
             series[turn] = value
 
     def fail(self, case: str, contender: str, why: str, after: float | None = None) -> None:
-        """Note that a contender did not get through a case, or was not done `after` seconds."""
+        """Note that a contender failed in a case, or was not done after `after` seconds."""
         self.failures.setdefault(case, {})[contender] = why
         if after is not None:
             self.unfinished.setdefault(case, {})[contender] = after
 
     def series(self, case: str, contender: str, metric: str) -> Series:
-        """The values by round, shorter than the run where a contender took part in fewer rounds."""
+        """Return the values by round, fewer than the run's rounds if the contender took part in
+        fewer."""
         return self.values.setdefault(case, {}).setdefault(contender, {}).setdefault(metric, [])
 
     def as_json(self) -> dict[str, Any]:
-        """Plain data from which `from_json` makes the same run."""
+        """Return plain data from which `from_json` makes the same run."""
         return dataclasses.asdict(self)
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Run:
-        """The run that `as_json` described."""
+        """Return the run that `as_json` described."""
         return cls(**data)

@@ -1,4 +1,4 @@
-"""Overhead: five workers sleep for one second each, in ever shorter tasks. The paper's figure."""
+"""Overhead: five workers sleep for one second each, in ever shorter tasks, as in the paper."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ ABOUT = f"""\
 {WORKERS} workers, one second of work for each, cut into tasks that sleep for 1 s down to 100
 µs: the figure in the paper's section "Framework overhead", with one more column. Without any
 overhead each batch would take 1 s (more at 100 µs, as Linux may let a sleep last 50 µs longer than
-asked). "Default chunks" is what each library does when no chunk size is given; concurrent.futures
-then sends one task at a time."""
+asked). With "default chunks" no chunk size is given, and each library uses its default;
+concurrent.futures then sends one task at a time."""
 
 DURATIONS = {1.0: "1 s", 0.1: "100 ms", 0.01: "10 ms", 0.001: "1 ms", 0.0001: "100 µs"}
 CHUNKS: dict[str, int | None] = {"chunksize 1": 1, "default chunks": None}
@@ -25,12 +25,12 @@ TIME = Metric("time", "time of the batch", "s")
 
 
 def case_name(duration: float, chunks: str) -> str:
-    """The name of the case for tasks of `duration` seconds."""
+    """Return the name of the case for tasks of `duration` seconds."""
     return f"{DURATIONS[duration]} tasks, {chunks}"
 
 
 def cases(size: float) -> list[Case]:
-    """The full measure at size 1; below, less work for each worker."""
+    """Return the full measure at size 1; below, less work for each worker."""
     return [
         Case(
             measure="overhead",
@@ -51,7 +51,7 @@ def cases(size: float) -> list[Case]:
 
 
 def run(bench: Bench, duration: float, tasks: int, chunksize: int | None) -> dict[str, float]:
-    """Seconds from handing over the batch to having all results."""
+    """Return seconds from handing over the batch to having all results."""
     bench.pool.map(sleep, [0] * WORKERS, chunksize)
     begin = time.perf_counter()
     results = bench.pool.map(sleep, [duration] * tasks, chunksize)

@@ -1,4 +1,4 @@
-"""joblib's parallel loops: tasks a second by what runs them."""
+"""joblib's parallel loops: tasks a second by backend."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ if TYPE_CHECKING:
 
 TITLE = "joblib"
 ABOUT = f"""\
-Loops of `joblib.Parallel(n_jobs={WORKERS})` on Fiber's backend, on loky, which is joblib's own, and
-on Dask's, with workers that are there. Tasks give an int back, at once or after a sleep, or take an
-array: each another one of 1 MB, or all the same one of 10 MB, which loky writes to a file once and
-Fiber copies to shared memory, for their workers to map. The batch size counts the tasks that travel
-together; "auto" begins at 1 in each loop and lets batches grow as long as they are short. Dask gets
-a tenth of the no-ops. The value of a round is the median of up to five loops in a row."""
+Loops of `joblib.Parallel(n_jobs={WORKERS})` on Fiber's backend, on joblib's default loky, and on
+Dask's, with running workers. Tasks return an int, at once or after a sleep, or take an array. Each
+task gets another array of 1 MB, or all tasks get the same array of 10 MB. loky writes the latter
+to a file once, and Fiber copies it to shared memory; their workers map it. The batch size is the
+number of tasks that travel together. "auto" begins at 1 in each loop and lets short batches grow.
+Dask gets a tenth of the no-ops. The value of a round is the median of up to five loops in a row."""
 
 RATE = Metric("rate", "tasks a second", "1/s")
 BASELINE = "joblib"
@@ -33,12 +33,12 @@ _ARRAY_BYTES = {DIFFERENT: MEGABYTE, SAME: 10 * MEGABYTE}
 
 
 def case_name(kind: str, batch_size: str) -> str:
-    """The name of the case with tasks of this kind in batches of this size."""
+    """Return the name of the case with tasks of this kind in batches of this size."""
     return f"{kind}, {batch_size}"
 
 
 def cases(size: float) -> list[Case]:
-    """The full measure at size 1; below, fewer tasks."""
+    """Return the full measure at size 1; below, fewer tasks."""
     return [
         Case(
             measure="parallel_loops",
@@ -56,7 +56,7 @@ def cases(size: float) -> list[Case]:
 
 
 def run(bench: Bench, kind: str, batch_size: int | None, tasks: int) -> dict[str, float]:
-    """Tasks a second."""
+    """Return tasks a second."""
     if kind == NO_OPS and not bench.light:
         tasks = max(10, tasks // 10)
     function, items, expected = _loop(kind, tasks)
@@ -66,7 +66,7 @@ def run(bench: Bench, kind: str, batch_size: int | None, tasks: int) -> dict[str
 
 
 def _loop(kind: str, tasks: int) -> tuple[Callable[[Any], Any], Sequence[Any], int]:
-    """What to call, with what each, and what the results add up to."""
+    """Return the function to call, its arguments, and the sum of the results."""
     if nbytes := _ARRAY_BYTES.get(kind):
         arrays = [ones(nbytes)] * tasks if kind == SAME else [ones(nbytes) for _ in range(tasks)]
         return size, arrays, nbytes * tasks

@@ -1,8 +1,8 @@
-"""The contenders behind one face: each adapter says in its library's words what measures ask for.
+"""Contenders with one interface: each adapter does what measures ask for with its library's calls.
 
-`chunksize` None means what the library does when nothing is said. Where a library has no such
-word, its closest natural one is used and named in the adapter. Libraries are imported by name,
-as hardly any has types to check against and most are not installed where types are checked.
+`chunksize` None means the library's default. If a library has no such call, the adapter names and
+uses its closest natural one. Libraries are imported by name, since hardly any has types to check
+against and most are not installed where types are checked.
 """
 
 from __future__ import annotations
@@ -20,31 +20,31 @@ Function = Callable[[Any], Any]
 
 
 class Adapter(abc.ABC):
-    """A pool of so many workers, started when made."""
+    """Pool of so many workers, which its constructor starts."""
 
     @abc.abstractmethod
     def map(self, function: Function, items: Sequence[Any], chunksize: int | None) -> Sequence[Any]:
-        """All results, in order."""
+        """Return all results, in order."""
 
     @abc.abstractmethod
     def apply(self, function: Function, item: Any) -> object:
-        """One call, waited for."""
+        """Make one call and wait for its result."""
 
     @abc.abstractmethod
     def close(self) -> None:
         """Stop the workers and wait until they are gone."""
 
     def stream(self, function: Function, items: Sequence[Any], chunksize: int) -> Iterable[Any]:
-        """Results as they come, in any order."""
+        """Yield results as they come, in any order."""
         raise NotImplementedError(f"{type(self).__name__} has no results in any order")
 
     def submit(self, function: Function, items: Sequence[Any]) -> list[Any]:
-        """One asynchronous call for each item, then all results."""
+        """Make one asynchronous call for each item, and then return all results."""
         raise NotImplementedError(f"{type(self).__name__} has no asynchronous calls")
 
 
 class PoolAdapter(Adapter):
-    """multiprocessing's Pool and what has its methods: Fiber's, Ray's."""
+    """multiprocessing's Pool and those with its methods: Fiber's, Ray's."""
 
     def __init__(self, pool: Any) -> None:
         self.pool = pool
@@ -82,7 +82,7 @@ def ray(workers: int) -> Any:
 
 
 class Ray(PoolAdapter):
-    """Ray's replacement for multiprocessing.Pool, on a Ray of its own."""
+    """Ray's replacement for multiprocessing.Pool, on a separate Ray."""
 
     def __init__(self, workers: int) -> None:
         self.ray = ray(workers)
@@ -94,7 +94,7 @@ class Ray(PoolAdapter):
 
 
 class Futures(Adapter):
-    """concurrent.futures' executor and what has its methods: the default chunk is one item."""
+    """concurrent.futures' executor and those with its methods: the default chunk is one item."""
 
     def __init__(self, executor: futures.Executor) -> None:
         self.executor = executor
@@ -153,7 +153,7 @@ class Joblib(Adapter):
     def _parallel(
         self, function: Function, items: Sequence[Any], batch: int | str, kind: str
     ) -> Iterable[Any]:
-        # By the context, as the name "dask" is known to nothing else.
+        # By the context, because nothing else knows the name "dask".
         with self.joblib.parallel_config(self.backend, n_jobs=self.workers):
             parallel = self.joblib.Parallel(batch_size=batch, return_as=kind)
         call = self.joblib.delayed(function)
@@ -162,20 +162,20 @@ class Joblib(Adapter):
 
 
 def joblib_on_loky(workers: int) -> Joblib:
-    """With the executor that joblib.Parallel gets too."""
+    """Make a loop with the executor that joblib.Parallel gets too."""
     executor = import_module("joblib.executor").get_memmapping_executor(workers)
     return Joblib(workers, executor, "loky", executor.shutdown)
 
 
 def joblib_on_fiber(workers: int) -> Joblib:
-    """With an executor of Fiber's."""
+    """Make a loop with an executor of Fiber's."""
     executor = import_module("fiber").Executor(workers)
     backend = import_module("fiber.joblib").FiberBackend(executor=executor)
     return Joblib(workers, executor, backend, executor.shutdown)
 
 
 def joblib_on_dask(workers: int) -> Joblib:
-    """With a cluster of Dask's, which joblib finds by itself."""
+    """Make a loop with a cluster of Dask's, which joblib finds by itself."""
     dask = Dask(workers)
     return Joblib(workers, dask.client.get_executor(), "dask", dask.close)
 
@@ -288,7 +288,7 @@ class Spark(Adapter):
 
 
 def processes_of(contender: str) -> Any:
-    """What has Process, Pipe and Pool: a context of multiprocessing, or the module fiber."""
+    """Namespace with Process, Pipe and Pool: a context of multiprocessing, or the module fiber."""
     if contender.startswith("fiber"):
         return import_module("fiber")
     multiprocessing = import_module("multiprocessing")
@@ -313,7 +313,8 @@ _ADAPTERS: dict[str, Callable[[int], Adapter]] = {
 
 
 def start(contender: str, workers: int = WORKERS, *, lazily: bool = False) -> Adapter:
-    """The contender's pool, its workers started, or `lazily`: Fiber's in pods by the first task."""
+    """Return the contender's pool with workers started, or `lazily`: Fiber's pods start by the
+    first task."""
     if make := _ADAPTERS.get(contender):
         return make(workers)
     pool = processes_of(contender).Pool(workers)

@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 TITLE = "Pipes"
 ABOUT = """\
 Round trip: this process sends, a process at the other end of a `Pipe()` receives and sends
-back, this process receives and touches every page of what came. From 28 KB (an Atari
+back, this process receives and touches every page of the message. From 28 KB (an Atari
 observation) up the message is a NumPy array. The value of a round is the median of its round
-trips. Where the kernel puts the two processes decides much of it, so it is measured too with both
-held on one processor, and with one on each of two. Vector step: one `step` of Gymnasium's
+trips. The time depends much on where the kernel puts the two processes. So it is also measured with
+both held on one processor, and with one on each of two. Vector step: one `step` of Gymnasium's
 AsyncVectorEnv with `shared_memory=False` over environments that do nothing; Fiber runs it by
 `fiber.adopt("gymnasium.vector.async_vector_env")`."""
 
@@ -46,17 +46,17 @@ _MODULE = "gymnasium.vector.async_vector_env"
 
 
 def environments(count: int) -> str:
-    """The name of the case with `count` environments."""
+    """Return the name of the case with `count` environments."""
     return f"{count} environments"
 
 
 def placed(message: str, place: str) -> str:
-    """The name of the case with this message and the processes held in this place."""
+    """Return the name of the case with this message and the processes held in this place."""
     return f"{message}, {place}"
 
 
 def cases(size: float) -> list[Case]:
-    """The full measure at size 1; below, fewer round trips."""
+    """Return the full measure at size 1; below, fewer round trips."""
     trips = [
         (TRIPS, name, ROUND_TRIP, {"nbytes": nbytes}, count) for name, nbytes, count in MESSAGES
     ]
@@ -92,7 +92,8 @@ def run(
     environments: int = 0,
     processors: int = 0,
 ) -> dict[str, float]:
-    """The median of up to `count` round trips or vector steps, as many as fit in `seconds`."""
+    """Return the median of up to `count` round trips or vector steps, as many as fit in
+    `seconds`."""
     if environments:
         return _vector_step(bench, environments, count, seconds)
     if not processors:
@@ -123,7 +124,7 @@ def _round_trip(
     try:
         return {ROUND_TRIP.name: _median_time(trip, count, seconds)}
     finally:
-        # Not by closing, as a forked child holds this end too and would never see its end.
+        # Not by closing: a forked child holds this end too and would never see its end.
         child.terminate()
         child.join()
         here.close()

@@ -1,4 +1,4 @@
-"""What /proc knows: who descends from whom, and how much memory they hold."""
+"""Facts of /proc: the descendants of a process, and the memory that they hold."""
 
 from __future__ import annotations
 
@@ -11,16 +11,18 @@ _PR_SET_CHILD_SUBREAPER = 36
 
 
 def adopt_orphans() -> None:
-    """Become the parent of every process below this one whose own parent dies: none gets away."""
+    """Become the parent of every process below this one whose parent dies, so that none gets
+    away."""
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
 
 
 def children_of_all(*, zombies: bool = False) -> dict[int, list[int]]:
-    """The processes by parent; with `zombies`, those too that ended and were not waited for."""
+    """Return the processes by parent; with `zombies`, also those that ended and were not waited
+    for."""
     children: dict[int, list[int]] = defaultdict(list)
     for entry in os.listdir("/proc"):
         if entry.isdigit() and (stat := _read(f"/proc/{entry}/stat")):
-            # The name stands in parentheses and may hold anything, parentheses too.
+            # The name stands in parentheses and may hold any characters, parentheses too.
             state, parent = stat.rpartition(")")[2].split()[:2]
             if zombies or state != "Z":
                 children[int(parent)].append(int(entry))
@@ -28,7 +30,7 @@ def children_of_all(*, zombies: bool = False) -> dict[int, list[int]]:
 
 
 def descendants(pid: int) -> list[int]:
-    """The living processes below `pid`, without itself."""
+    """Return the living processes below `pid`, without itself."""
     children, found, ahead = children_of_all(), [], [pid]
     while ahead:
         below = children.get(ahead.pop(), [])
@@ -44,18 +46,19 @@ def runs(pid: int) -> bool:
 
 
 def memory(pid: int) -> int:
-    """Bytes held by `pid` and all below it: PSS, where a page shared by n counts 1/n for each."""
+    """Return bytes held by `pid` and all below it: PSS, where a page shared by n counts 1/n for
+    each."""
     return sum(pss(each) for each in (pid, *descendants(pid)))
 
 
 def name_of(pid: int) -> str:
-    """The first words of its command line, or its short name."""
+    """Return the first words of its command line, or its short name."""
     words = _read(f"/proc/{pid}/cmdline").replace("\0", " ").strip()
     return (words or _read(f"/proc/{pid}/comm").strip() or "gone")[:80]
 
 
 def pss(pid: int) -> int:
-    """Bytes held by `pid` alone, as `memory` counts; 0 if it is gone."""
+    """Return bytes held by `pid` alone, as `memory` counts; 0 if it is gone."""
     for line in _read(f"/proc/{pid}/smaps_rollup").splitlines():
         if line.startswith("Pss:"):
             return int(line.split()[1]) * 1024
@@ -66,5 +69,5 @@ def _read(path: str) -> str:
     try:
         return Path(path).read_text(errors="replace")
     except OSError:
-        # It ended between the listing and this look, which is as good as never seen.
+        # It ended between the listing and this look, so it counts as never seen.
         return ""

@@ -1,4 +1,4 @@
-"""From runs to pages: one page of tables for each measure, and an index with the budgets."""
+"""Pages from runs: one page of tables for each measure, and an index with the budgets."""
 
 from __future__ import annotations
 
@@ -20,14 +20,15 @@ _OTHER_PAGES = {
     "operator.md": "[Operator](operator.md): thousands of pods",
     "notes.md": "[Notes](notes.md): why a budget is missed and what was tried",
 }
-"""Made by other commands, and by hand: what the index says of each."""
+"""Pages that other commands or people write, and what the index says of each."""
 _GENERATED = (
     "<!-- Written by benchmarks/run.py from results.json; changes made by hand are lost. -->"
 )
 
 
 def load(folder: Path) -> dict[str, Run]:
-    """The runs of an earlier report, by measure, so that one measure can be run again alone."""
+    """Return the runs of an earlier report, by measure, so that one measure can be run again
+    alone."""
     path = folder / RESULTS
     if not path.exists():
         return {}
@@ -38,7 +39,7 @@ def load(folder: Path) -> dict[str, Run]:
 
 
 def write(folder: Path, runs: Mapping[str, Run], new: Iterable[str]) -> None:
-    """The results, a page and a picture for each measure in `new`, and the index over all."""
+    """Write the results, a page and a picture for each measure in `new`, and the index over all."""
     folder.mkdir(parents=True, exist_ok=True)
     data = {name: runs[name].as_json() for name in MEASURES if name in runs}
     (folder / RESULTS).write_text(json.dumps(data, separators=(",", ":")) + "\n", encoding="utf-8")
@@ -50,7 +51,7 @@ def write(folder: Path, runs: Mapping[str, Run], new: Iterable[str]) -> None:
 
 
 def page(name: str, run: Run) -> str:
-    """The page of one measure."""
+    """Return the page of one measure."""
     measure = MEASURES[name]
     cases = measure.cases(run.about["size"])
     groups = {case.group: [each for each in cases if each.group == case.group] for case in cases}
@@ -72,25 +73,26 @@ def page(name: str, run: Run) -> str:
 
 
 def index(runs: Mapping[str, Run], others: Iterable[str] = ()) -> str:
-    """The index: where the pages are, these others too, and every budget with its verdict."""
+    """Return the index: the pages, these others too, and every budget with its verdict."""
     pages = [f"[{MEASURES[name].TITLE}]({name}.md)" for name in MEASURES if name in runs]
     found = budgets.verdicts(runs)
     met = sum(v.kept is True for v in found)
     parts = [
         _GENERATED,
         "# Benchmarks",
-        "`make bench` writes these pages. A ratio is taken within each round; then the median over "
-        "the rounds is given.",
+        "`make bench` writes these pages. A ratio is taken within each round. The tables show its "
+        "median over the rounds.",
         "\n".join(f"* {page}" for page in (*pages, *others)),
         "## Budgets",
-        f"{met} of {len(found)} met. Contender: Fiber with local processes, if not said otherwise.",
+        f"{met} of {len(found)} met. The contender is Fiber with local processes, unless a row "
+        "says otherwise.",
         budget_table(found),
     ]
     return "\n\n".join(parts) + "\n"
 
 
 def budget_table(found: Iterable[budgets.Verdict]) -> str:
-    """A row for each budget."""
+    """Return a row for each budget."""
     rows = [
         (v.budget.what, _against(v.budget), v.budget.in_words(), v.measured, v.verdict)
         for v in found
@@ -99,7 +101,7 @@ def budget_table(found: Iterable[budgets.Verdict]) -> str:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table."""
+    """Return a Markdown table."""
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
@@ -111,7 +113,7 @@ def _against(budget: budgets.Budget) -> str:
 
 
 def group_table(run: Run, cases: Sequence[Case]) -> str:
-    """A row for each case, metric and contender, with its ratio, budget and verdict."""
+    """Return a row for each case, metric and contender, with its ratio, budget and verdict."""
     several = len({metric.label for case in cases for metric in case.metrics}) > 1
     head = (
         "case",
@@ -161,7 +163,7 @@ def _rows(run: Run, case: Case, metric: Metric) -> list[tuple[str, ...]]:
 
 
 def ratio_in_words(found: Summary | None) -> str:
-    """Its median, and from where to where it went."""
+    """Return the median of a ratio, and its least and greatest value."""
     if not found:
         return "—"
     if found.rounds == 1:
@@ -170,7 +172,7 @@ def ratio_in_words(found: Summary | None) -> str:
 
 
 def _verdict(run: Run, case: Case, metric: Metric, contender: str) -> tuple[str, str]:
-    """Bounds and verdicts of the row, of which most have one or none."""
+    """Return bounds and verdicts of the row, of which most have one or none."""
     found = [
         (f"{budget.in_words()}{_to_whom(budget, case)}", budgets.judge(budget, {case.measure: run}))
         for budget in budgets.of(case.measure, case.name, metric.name, contender)
@@ -179,14 +181,14 @@ def _verdict(run: Run, case: Case, metric: Metric, contender: str) -> tuple[str,
 
 
 def _to_whom(budget: budgets.Budget, case: Case) -> str:
-    """Whose value the bound is a multiple of, where it is not the baseline's."""
+    """Return the contender whose value the bound is a multiple of, if it is not the baseline."""
     if budget.unit or (budget.against == case.baseline and not budget.to_case):
         return ""
     return f" {_against(budget)}"
 
 
 def reading(run: Run, cases: Sequence[Case]) -> str:
-    """How to read the tables, and whether the machine was idle."""
+    """Return how to read the tables, and whether the machine was idle."""
     rounds = run.about["rounds"]
     measured = [
         case.baseline
@@ -221,7 +223,7 @@ def _company(in_use: Sequence[float]) -> str:
 
 
 def failures(run: Run) -> str:
-    """Who did not get through what, and why; empty if nobody."""
+    """Return which contenders failed in which cases, and why; empty if none did."""
     rows = [
         (case, BY_NAME[contender].label, why.replace("|", "\\|").replace("\n", " "))
         for case, failed in run.failures.items()
@@ -242,7 +244,7 @@ def _skipped(run: Run) -> list[tuple[str, str]]:
 
 
 def origin(about: Mapping[str, Any]) -> str:
-    """Where, when and with what a run was made."""
+    """Return where, when and with what a run was made."""
     versions = ", ".join(f"{name} {version}" for name, version in about["versions"].items())
     rows = {
         "machine": f"{about['cores']} cores ({about['processor']}), {about['memory']} of memory",

@@ -1,4 +1,4 @@
-"""The order of a run: every round visits every contender, in an order that rotates."""
+"""Order of a run: every round visits every contender, in an order that rotates."""
 
 from __future__ import annotations
 
@@ -22,23 +22,24 @@ Say = Callable[[str], None]
 
 
 def in_turn(contenders: Sequence[Contender], turn: int) -> list[Contender]:
-    """The contenders, begun one later at each turn, so that no one always follows the same one."""
+    """Return the contenders, begun one later at each turn, so that none always follows the same
+    one."""
     start = turn % len(contenders) if contenders else 0
     return [*contenders[start:], *contenders[:start]]
 
 
 def say(text: str) -> None:
-    """Progress, on standard error."""
+    """Print progress on standard error."""
     print(text, file=sys.stderr, flush=True)
 
 
 class Rounds:
-    """Runs cases with contenders round by round and keeps what they give.
+    """Runner of cases with contenders, round by round, which keeps the samples.
 
-    Contenders without servers keep one process for the whole run and take turns within each
-    case, so that the values that are divided by each other were measured seconds apart. The
-    others would disturb them even when idle: each is started for its turn in a round, does all
-    cases, and is stopped.
+    Contenders without servers keep one process for the whole run and take turns within each case,
+    so that values whose ratio is taken were measured seconds apart. The others would disturb them
+    even when idle. So each of those is started for its turn in a round, does all cases, and is
+    stopped.
     """
 
     def __init__(
@@ -56,7 +57,7 @@ class Rounds:
         self._finished: set[tuple[str, str, str]] = set()
 
     def play(self, cases: Sequence[Case], contenders: Sequence[Contender], rounds: int) -> None:
-        """All rounds; afterwards no contender runs any more."""
+        """Run all rounds; afterwards no contender runs."""
         light = [each for each in contenders if not each.servers]
         heavy = [each for each in contenders if each.servers]
         for turn in range(rounds):
@@ -75,7 +76,7 @@ class Rounds:
             self._end(key, Session.stop)
 
     def abandon(self) -> None:
-        """Stop every contender that still runs, whatever it is doing."""
+        """Stop every contender that still runs, even in the middle of a case."""
         for session in self._sessions.values():
             session.interrupt()
         self._sessions.clear()
@@ -95,7 +96,7 @@ class Rounds:
         try:
             sample = self._sample(case, contender)
         except Failed as failure:
-            # Once is enough: it would only hold up the others again.
+            # Once is enough: another try would only delay the others.
             self._finished.add(key)
             run.fail(case.name, contender.name, str(failure), failure.after)
             self._say(f"{where}  failed: {failure}")
@@ -128,7 +129,7 @@ class Rounds:
 
 @contextmanager
 def scratch_folder() -> Iterator[Path]:
-    """A folder for all that contenders write, gone afterwards."""
+    """Make a folder for all that contenders write, and remove it afterwards."""
     folder = Path(tempfile.mkdtemp(prefix="bench-"))
     try:
         yield folder

@@ -24,7 +24,7 @@ class Summary:
 
 
 def summary(values: Series) -> Summary | None:
-    """None if no round gave a value."""
+    """Return the spread; None if no round gave a value."""
     present = [value for value in values if value is not None]
     if not present:
         return None
@@ -32,28 +32,29 @@ def summary(values: Series) -> Summary | None:
 
 
 def ratio(values: Series, baseline: Series) -> Summary | None:
-    """The ratio of each round in which both have a value, then its median and spread.
+    """Return the ratio of each round in which both have a value, then its median and spread.
 
-    Dividing within a round cancels what slows down the whole machine for a while;
-    dividing two medians would not.
+    Dividing within a round cancels what slows down the whole machine for a while; dividing two
+    medians would not.
     """
     pairs = zip(values, baseline, strict=False)
     return summary([a / b for a, b in pairs if a is not None and b])
 
 
 def percentile(values: Sequence[float], percent: float) -> float:
-    """The value below which `percent` of the values lie, without interpolation; needs a value."""
+    """Return the value below which `percent` of the values lie, without interpolation; needs a
+    value."""
     ordered = sorted(values)
     return ordered[min(len(ordered) - 1, int(len(ordered) * percent / 100))]
 
 
 def is_idle(in_use: Sequence[float]) -> bool:
-    """Whether others never used more than 5 % of the processors' time."""
+    """Tell whether other programs never used more than 5 % of the processors' time."""
     return max(in_use) <= IDLE
 
 
 def in_words(value: float, unit: str) -> str:
-    """A number with three significant digits and a fitting unit: 0.00131 s is "1.31 ms"."""
+    """Return a number with three significant digits and a fitting unit: 0.00131 s is "1.31 ms"."""
     if unit == "s":
         return _scaled(value, _TIMES)
     if unit == "B":
@@ -64,7 +65,7 @@ def in_words(value: float, unit: str) -> str:
 
 
 def times(value: float) -> str:
-    """A ratio in words: "0.65x", "21.3x"; finer near one, as the budgets are."""
+    """Return a ratio in words: "0.65x", "21.3x"; finer near one, as the budgets are."""
     fine = value < 0.1 or 0.9 <= value < 1.1
     digits = 3 if fine else 2 if value < 10 else 1 if value < 100 else 0
     return f"{value:,.{digits}f}x"

@@ -1,11 +1,11 @@
-"""A cluster that is a script: an API server, pods that come at once, and fake agents in them.
+"""Scripted cluster: an API server, pods that come at once, and fake agents in them.
 
     python -m benchmarks.scripted_cluster AGENTS       (PYTHONPATH=tests)
 
-It prints the URL of the API server.  Each FiberPool gets the pods that it wants, in as many steps
-as those of a real one have, and loses those that it names.  The agents, which are those of
-`agent_host`, dial once so many pods run.  For each line on standard input it prints, as JSON,
-what clients have asked for until then; at the end of standard input it ends.
+It prints the URL of the API server. Each FiberPool gets the pods that it wants, in as many steps as
+on a real cluster, and loses those that it names. The agents, which are those of `agent_host`, dial
+once so many pods run. For each line on standard input it prints, as JSON, the requests of clients
+until then. It ends at the end of standard input.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from fiber_api import identity, names
 Body = dict[str, Any]
 
 _BATCH, _PAUSE = 50, 0.02
-"""So many pods take a step together, and seconds until the next so many do."""
+"""Number of pods that take a step together, and seconds until the next so many do."""
 
 _STATUS = 0.2
 """Seconds from one status of a pool to the next, while its pods change."""
@@ -41,11 +41,11 @@ _STATUS = 0.2
 _DIALS = 120.0
 
 _MANAGED: Body = {"f:metadata": {f"f:field-{n}": {f"k:{n}": {}} for n in range(60)}}
-"""As much as an API server's managedFields and defaults add to a pod."""
+"""Bytes that an API server's managedFields and defaults add to a pod."""
 
 
 class CountingApi(KubernetesApi):
-    """Counts calls, and bytes of patches and lists."""
+    """Counter of calls, and of the bytes of patches and lists."""
 
     def __init__(self, store: Store) -> None:
         super().__init__(store)
@@ -64,7 +64,7 @@ class CountingApi(KubernetesApi):
 
 
 class Pool:
-    """What an operator, a scheduler and kubelets do for one FiberPool, without their thinking."""
+    """Script for one FiberPool: what an operator, a scheduler and kubelets would do."""
 
     def __init__(self, store: Store, body: Body, hosts: Sequence[Host], agents: int) -> None:
         self._store = store
@@ -76,7 +76,7 @@ class Pool:
         self._told = 0.0
 
     async def follow(self) -> None:
-        """Until it is gone."""
+        """Run until the pool is gone."""
         while (body := self._body()) is not None:
             spec, pods = body["spec"], self._pods()
             release = set(spec.get("scaleDown", {}).get("release", ())) & pods.keys()
@@ -109,7 +109,7 @@ class Pool:
             await asyncio.sleep(_PAUSE)
 
     def _dial(self, body: Body) -> None:
-        """The agents of all pods begin."""
+        """Start the agents of all pods."""
         secret, master = self._secret(body["spec"]), body["spec"]["master"]
         assert secret is not None
         key = identity.key_in(secret["data"])
@@ -123,7 +123,7 @@ class Pool:
             host.stdin.flush()
 
     def _agents_of(self, key: str, pin: str, pods: list[str]) -> list[Credentials]:
-        """What the init container of each pod writes."""
+        """Return what the init container of each pod writes."""
         uids = {name: pod["metadata"]["uid"] for name, pod in self._pods().items()}
         return [
             Credentials(name, uids[name], identity.agent_key(key, name, uids[name]), pin)
@@ -199,7 +199,7 @@ async def _watch_over(host: Host) -> None:
 
 
 async def main(agents: int) -> None:
-    """Be the cluster."""
+    """Play the cluster."""
     store = Store(time.monotonic)
     api = CountingApi(store)
     tasks = []

@@ -1,4 +1,5 @@
-"""The run's side of a contender process: start it, ask it, stop it, leave nothing of it behind."""
+"""Session with a contender process: start it, ask it, stop it, and leave none of its processes
+behind."""
 
 from __future__ import annotations
 
@@ -24,7 +25,7 @@ _STRAGGLERS = 3.0
 
 
 class Failed(Exception):
-    """A contender did not get through a case; the text says why. Its session is of no more use.
+    """Failure of a contender in a case; the text says why. Its session is of no more use.
 
     `after`: the seconds after which it was stopped, if it was merely too slow.
     """
@@ -35,7 +36,7 @@ class Failed(Exception):
 
 
 class Session:
-    """One contender process, and every process below it."""
+    """Contender process, and every process below it."""
 
     def __init__(self, contender: Contender, scratch: Path) -> None:
         self.contender = contender
@@ -60,11 +61,12 @@ class Session:
 
     @property
     def pid(self) -> int:
-        """Of the contender process."""
+        """Return the pid of the contender process."""
         return self._process.pid
 
     def run(self, case: Case) -> dict[str, float]:
-        """The contender's sample for the case; `Failed` if it raised, died, or was too slow."""
+        """Return the contender's sample for the case; `Failed` if it raised, died, or was too
+        slow."""
         request = {"measure": case.measure, "params": dict(case.params)}
         try:
             self._stdin().write(json.dumps(request).encode() + b"\n")
@@ -112,7 +114,7 @@ class Session:
         return self._process.stdin
 
     def _line(self, limit: float) -> bytes:
-        """The next line of the contender; what follows it stays for later."""
+        """Return the next line of the contender, and keep what follows for later."""
         assert self._process.stdout is not None
         fd, end = self._process.stdout.fileno(), time.monotonic() + limit
         while b"\n" not in self._rest:
@@ -138,10 +140,10 @@ class Session:
 
 
 def sweep(living: set[int]) -> list[str]:
-    """Kill what ended sessions left behind, and return its names; a moment to go by itself first.
+    """Kill what ended sessions left behind, and return its names; allow a moment to end first.
 
-    This process adopts orphans, so everything left behind is a child of it that is in no
-    living session.
+    This process adopts orphans, so every process that was left behind is a child of it that is in
+    no living session.
     """
     end = time.monotonic() + _STRAGGLERS
     while (left := _left(living)) and time.monotonic() < end:

@@ -16,13 +16,13 @@ if TYPE_CHECKING:
 
 TITLE = "Sharing"
 ABOUT = """\
-Queue: an int goes to another process by one `Queue` and comes back by a second; and 20,000 ints
-come from another process as fast as they can be read. Manager call: one `get` of a dict of
+Queue: an int goes to another process by one `Queue` and comes back by a second. A stream of 20,000
+ints comes from another process as fast as it can be read. Manager call: one `get` of a dict of
 `Manager()`. Lock, Value: `with lock`, and `with value.get_lock(): value.value += 1`, by this
-process alone, and by four processes at a time (the time divided by all that they did). Array: a
-process elsewhere writes all of an `Array` by NumPy and says so, and this process reads all of it.
-Barrier: eight processes, of which one is this, wait at one barrier. Loopback agents stand for
-other hosts: with them every one of these is a request to this process, and arrays are sent."""
+process alone, and by four processes at a time (the time divided by the number of all steps).
+Array: another process writes all of an `Array` by NumPy and says so, and this process reads all
+of it. Barrier: eight processes, this one included, wait at one barrier. Loopback agents stand for
+other hosts: with them each of these steps is a request to this process, and arrays are sent."""
 
 CALL = Metric("call", "time of one", "s")
 RATE = Metric("rate", "items", "1/s")
@@ -37,12 +37,12 @@ _WRITERS = 4
 
 
 def array(megabytes: int) -> str:
-    """The name of the case with an array of so many megabytes."""
+    """Return the name of the case with an array of so many megabytes."""
     return f"array of {megabytes} MB"
 
 
 def cases(size: float) -> list[Case]:
-    """The full measure at size 1; below, fewer of each."""
+    """Return the full measure at size 1; below, fewer of each."""
     kinds: list[tuple[str, str, Metric, dict[str, Any], int]] = [
         (QUEUES, ROUND_TRIP, CALL, {"what": "round_trip"}, 3000),
         (QUEUES, STREAM, RATE, {"what": "stream"}, 20_000),
@@ -72,7 +72,7 @@ def cases(size: float) -> list[Case]:
 
 
 def run(bench: Bench, what: str, count: int, **params: int) -> dict[str, float]:
-    """One value of one case."""
+    """Return one value of one case."""
     with ExitStack() as stack:
         return _MEASURES[what](bench.processes, stack, count, **params)
 
@@ -94,7 +94,7 @@ def _median_time(action: Callable[[], object], count: int) -> dict[str, float]:
 
 
 def _mean_time(action: Callable[[], object], count: int) -> dict[str, float]:
-    """For what takes less than the clock itself can tell."""
+    """Return seconds for each of `count` calls that are shorter than the clock can tell."""
     action()
     begin = time.perf_counter()
     for _ in range(count):

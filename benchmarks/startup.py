@@ -1,4 +1,4 @@
-"""Start-up: until the last of n workers works, their memory, until they are gone; the import."""
+"""Start-up: time until the last of n workers works, their memory, their end; the import."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ _PATIENCE = 40.0
 
 
 def workers(count: int) -> str:
-    """The name of the case with `count` workers."""
+    """Return the name of the case with `count` workers."""
     return f"{count:,} worker{'s' if count > 1 else ''}"
 
 
 def cases(size: float) -> list[Case]:
-    """The full measure at size 1; below, without the largest pools."""
+    """Return the full measure at size 1; below, without the largest pools."""
     counts = [n for n in WORKERS if n <= 5 or n <= _MOST * size]
     pools = [
         Case(
@@ -69,7 +69,8 @@ def cases(size: float) -> list[Case]:
 
 
 def run(bench: Bench, workers: int = 0, interpreters: int = 0) -> dict[str, float]:
-    """Time and memory of a pool of `workers`, or the median import time over new `interpreters`."""
+    """Return time and memory of a pool of `workers`, or the median import time over new
+    `interpreters`."""
     if interpreters:
         return {
             IMPORT.name: median(
@@ -96,7 +97,7 @@ def run(bench: Bench, workers: int = 0, interpreters: int = 0) -> dict[str, floa
 
 @contextlib.contextmanager
 def meeting_point() -> Iterator[tuple[str, int]]:
-    """A named pipe into which every worker writes one byte."""
+    """Named pipe into which every worker writes one byte."""
     with tempfile.TemporaryDirectory() as folder:
         path = str(Path(folder, "workers"))
         os.mkfifo(path)

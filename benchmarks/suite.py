@@ -1,4 +1,4 @@
-"""The measures by name, in the order of the pages."""
+"""Measures by name, in the order of the pages."""
 
 from __future__ import annotations
 

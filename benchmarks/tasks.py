@@ -1,4 +1,5 @@
-"""What the workers run. Importable by name from every contender's workers, and cheap to import."""
+"""Functions that the workers run. Importable by name from every contender's workers, and cheap to
+import."""
 
 from __future__ import annotations
 
@@ -28,7 +29,7 @@ _kept = b""
 
 
 def content(nbytes: int) -> bytes:
-    """Bytes in memory that was written to, as all data is that a program computed."""
+    """Return bytes in memory that was written to, as all data is that a program computed."""
     return b"x" * nbytes
 
 
@@ -39,7 +40,7 @@ def keep(nbytes: int) -> None:
 
 
 def kept() -> bytes:
-    """Give a large result that was there before."""
+    """Return a large result that existed before the call."""
     return _kept
 
 
@@ -53,7 +54,7 @@ def announce(path: str) -> None:
 
 
 def echo(connection: Any, processor: int | None = None) -> None:
-    """Send back what comes until terminated, on this processor if one is given."""
+    """Send each message back until terminated, on this processor if one is given."""
     if processor is not None:
         os.sched_setaffinity(0, {processor})
     while True:

@@ -43,7 +43,7 @@ if __name__ == "__main__":
 
 
 def measure(contender: str, workers: int) -> list[float]:
-    """Seconds until the first map of the first and of the second pool of a new program."""
+    """Return seconds until the first map of the first and of the second pool of a new program."""
     with tempfile.TemporaryDirectory() as folder:
         program = Path(folder, "program.py")
         program.write_text(PROGRAM.format(contender=CONTENDERS[contender]))
@@ -58,7 +58,7 @@ def measure(contender: str, workers: int) -> list[float]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure and print; 1 if jax is not installed."""
+    """Measure and print; return 1 if jax is not installed."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--workers", type=int, nargs="+", default=[2, 8])
     parser.add_argument("--programs", type=int, default=3, help="programs for each median")

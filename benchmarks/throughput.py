@@ -1,4 +1,4 @@
-"""Throughput: how many tasks a second when the tasks do nothing, and how fast large data passes."""
+"""Throughput: no-op tasks a second, and how fast large data passes."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ if TYPE_CHECKING:
 
 TITLE = "Throughput"
 ABOUT = f"""\
-{WORKERS} workers. No-op tasks give their argument, an int, back. Their function is one of an
-importable module or, where the case says so, of the main module, as in most scripts. Contenders
-with servers of their own (Dask, ipyparallel, Ray, Spark) get a tenth of the no-op tasks, so that
-a round ends in bearable time. The batches of arrays are 100 different ones of 1 MB, sent with
-chunksize 1.
-The long task stands in the middle of its batch, which is sent in default chunks: the time
-shows whether short tasks wait behind the long one, and whether the long one waited for its
-turn. Each other value of a round is the median of up to five batches in a row."""
+{WORKERS} workers. No-op tasks return their argument, an int. Their function is one of an importable
+module or, where the case says so, of the main module, as in most scripts. Contenders with servers
+(Dask, ipyparallel, Ray, Spark) get a tenth of the no-op tasks, so that a round ends in bearable
+time. A batch of arrays has 100 different arrays of 1 MB, sent with chunksize 1.
+
+The long task stands in the middle of its batch, which is sent in default chunks. The time shows
+whether short tasks wait behind the long one, and whether the long one waited for its turn. Each
+other value of a round is the median of up to five batches in a row."""
 
 RATE = Metric("rate", "tasks a second", "1/s")
 TIME = Metric("time", "time of the batch", "s")
@@ -32,7 +32,7 @@ LONG = "one long task"
 MEGABYTE = 1 << 20
 OF_MAIN = "function of __main__"
 
-# Name, what it needs, method, chunk size, tasks.
+# Name, ability, method, chunk size, tasks.
 _NO_OPS: tuple[tuple[str, str, str, int | None, int], ...] = (
     ("map, chunksize 1", "map", "map", 1, 10_000),
     ("map, default chunks", "map", "map", None, 100_000),
@@ -51,7 +51,7 @@ LONG_NAME = "1 s among 10,000 no-ops"
 
 
 def cases(size: float) -> list[Case]:
-    """The full measure at size 1; below, fewer tasks."""
+    """Return the full measure at size 1; below, fewer tasks."""
 
     def case(name: str, group: str, needs: str, metric: Metric, **params: Any) -> Case:
         return Case("throughput", name, group, needs, params, (metric,))
@@ -83,7 +83,7 @@ def cases(size: float) -> list[Case]:
 def run(
     bench: Bench, kind: str, tasks: int, chunksize: int | None, *, of_main: bool = False
 ) -> dict[str, float]:
-    """Tasks a second for no-ops; for the others the seconds of the batch."""
+    """Return tasks a second for no-ops; for the others the seconds of the batch."""
     if kind == "long":
         return _long(bench, tasks)
     if kind in ARRAY_KINDS.values():
@@ -110,7 +110,7 @@ def _no_ops(
 
 
 def rate(batch: Callable[[int], Iterable[Any]], tasks: int) -> float:
-    """Tasks a second, for a batch that gives the numbers below its argument back."""
+    """Return tasks a second, for a batch that returns the numbers below its argument."""
     return tasks / time_of(lambda: sum(batch(tasks)), sum(range(tasks)))
 
 
@@ -138,13 +138,13 @@ def _long(bench: Bench, tasks: int) -> dict[str, float]:
 
 
 def nap(seconds: float) -> None:
-    """Sleep if there is anything to sleep; even a sleep of 0 s is a system call."""
+    """Sleep if there is a time to sleep; even a sleep of 0 s is a system call."""
     if seconds:
         sleep(seconds)
 
 
 def time_of(batch: Callable[[], int], expected: int) -> float:
-    """Seconds of a batch whose results add up to this.
+    """Return seconds of a batch whose results add up to this.
 
     The median of up to five batches, or of as many as fit in half a second, at least one.
     """

@@ -1,4 +1,4 @@
-"""Vector environments: steps a second of many environments, whoever steps them."""
+"""Vector environments: steps a second of many environments, by contender."""
 
 from __future__ import annotations
 
@@ -21,26 +21,30 @@ _A_PROCESS_EACH = (BASELINE, "stable-baselines3")
 _MOST_PROCESSES = 512
 TITLE = "Vector environments"
 ABOUT = f"""\
-Steps a second of all environments together. CartPole is Gymnasium's; the others do nothing but
-sleep for a millisecond, or change an observation of 84x84x4 bytes, or take five milliseconds in
-one step of ten and else a tenth of one. First ready: a quarter of the uneven environments is
-received at a time, those that were ready first, and sent back; ratios are to Fiber's there.
+Steps a second of all environments together. CartPole is Gymnasium's. The other environments sleep
+for a millisecond, or change an observation of 84x84x4 bytes, or are uneven: one step in ten takes
+five milliseconds and the others a tenth of one. First ready: the program receives a quarter of the
+uneven environments at a time, those that are ready first, and sends them back. There, ratios are to
+Fiber's value.
 
-Fiber is `fiber.vector.VectorEnv`. AsyncVectorEnv and SyncVectorEnv are Gymnasium's; the first has a
-process for each environment, forked, as stable-baselines3's SubprocVecEnv has, and more than
-{_MOST_PROCESSES} they are not asked for. Who shares workers has one a processor for CartPoles and
-for large observations, and for environments that sleep one for each, but at most {SLOW_WORKERS}:
-Fiber, PufferLib, Ray. PufferLib is its backend Multiprocessing, from the package pufferlib-core, as
-pufferlib itself has to be built with torch. Ray's are plain actors, as RLlib's need torch: each has
-its share of the environments in a SyncVectorEnv, and the program puts together what they return.
-EnvPool runs environments of its own alone, which are written in C++: of these its CartPole is
-measured, with a thread a processor, and it says what Python costs, not what its workers do.
-SubprocVecEnv and PufferLib import torch and do not use it here: where it is not installed, a
-stand-in is.
+* Fiber is `fiber.vector.VectorEnv`.
+* AsyncVectorEnv and SyncVectorEnv are Gymnasium's. AsyncVectorEnv has a forked process for each
+  environment, as stable-baselines3's SubprocVecEnv has. Both are measured with at most
+  {_MOST_PROCESSES} environments.
+* Fiber, PufferLib and Ray share workers: one for each processor for CartPoles and for large
+  observations. For environments that sleep they have one for each, but at most {SLOW_WORKERS}.
+* PufferLib is its backend Multiprocessing, from the package pufferlib-core, because pufferlib
+  itself must be built with torch.
+* Ray's are plain actors, because RLlib's need torch. Each has its share of the environments in a
+  SyncVectorEnv, and the program joins their results.
+* EnvPool runs only its environments, which are written in C++. Its CartPole is measured, with a
+  thread for each processor. It shows what Python costs, not how good its workers are.
+* SubprocVecEnv and PufferLib import torch and do not use it here. If it is not installed, a
+  stand-in takes its place.
 
-Before the clock starts a vector is reset and makes three steps, or as many as fit into a quarter of
-the time that is measured. More than {_EVERY_ROUND} environments take as long to make as to measure,
-and are measured in one round."""
+Before the clock starts, a vector is reset and makes three steps, or as many as fit into a quarter
+of the measured time. More than {_EVERY_ROUND} environments take as long to make as to measure, and
+are measured in one round."""
 
 RATE = Metric("rate", "environment steps a second", "1/s")
 FIRST_READY = "first ready"
@@ -51,28 +55,29 @@ PANELS = {
     "uneven ones": "environments with uneven steps",
     f"uneven ones, {FIRST_READY}": f"environments with uneven steps, {FIRST_READY}",
 }
-"""The groups of cases, by what ends the names of theirs."""
+"""Groups of cases, by the ends of their names."""
 _KINDS = ("cart_pole", "Sleeping", "Pixels", "Uneven", "Uneven")
 _SLOW = ("Sleeping", "Uneven")
 
 
 def cart_poles(count: int) -> str:
-    """The name of the case with `count` of them."""
+    """Return the name of the case with `count` of them."""
     return f"{count:,} CartPoles"
 
 
 def pixels(count: int) -> str:
-    """The name of the case with `count` environments with large observations."""
+    """Return the name of the case with `count` environments with large observations."""
     return f"{count:,} with 84x84x4 bytes"
 
 
 def uneven(count: int, *, first_ready: bool = False) -> str:
-    """The name of the case with `count` environments with uneven steps."""
+    """Return the name of the case with `count` environments with uneven steps."""
     return f"{count:,} uneven ones" + (f", {FIRST_READY}" if first_ready else "")
 
 
 def cases(size: float) -> list[Case]:
-    """The full measure at size 1; below, shorter, and with fewer environments if far below."""
+    """Return the full measure at size 1; below, shorter, and with fewer environments if far
+    below."""
     return [
         _case(kind, count, f"{count:,} {ending}", group, size)
         for kind, (ending, group) in zip(_KINDS, PANELS.items(), strict=True)
@@ -98,7 +103,7 @@ def _case(kind: str, count: int, name: str, group: str, size: float) -> Case:
         metrics=(RATE,),
         limit=60.0,
         rounds=None if count <= _EVERY_ROUND else 1,
-        # Those that have a process for each environment have no batches that are ready first.
+        # Contenders with a process for each environment have no batches that are ready first.
         baseline="fiber" if batch else BASELINE,
         not_run={}
         if batch or count <= _MOST_PROCESSES
@@ -109,7 +114,7 @@ def _case(kind: str, count: int, name: str, group: str, size: float) -> Case:
 def run(
     bench: Bench, kind: str, count: int, seconds: float, workers: int | None, batch: int
 ) -> dict[str, float]:
-    """Steps for so many seconds, in batches of `batch` that are ready first, or all together."""
+    """Step for so many seconds, in batches of `batch` that are ready first, or all together."""
     make: Callable[[], Any] = getattr(environment, kind)
     env = vector_peers.start(bench.contender, make, count, workers, batch)
     try:
@@ -133,14 +138,14 @@ def _first_ready(env: Any, count: int, batch: int) -> Callable[[], object]:
         env.recv(batch)
         env.send(actions)
 
-    # So often that all environments are there and have made steps.
+    # So often that all environments are made and have stepped.
     for _ in range(2 * count // batch):
         step()
     return step
 
 
 def _rate(step: Callable[[], object], count: int, seconds: float) -> float:
-    """Environment steps a second, where each call makes `count` of them."""
+    """Return environment steps a second, where each call makes `count` of them."""
     warm = time.perf_counter() + seconds / 4
     for _ in range(3):
         step()

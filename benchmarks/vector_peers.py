@@ -1,8 +1,8 @@
-"""Vector environments behind one face: each adapter says in its library's words what is asked for.
+"""Vector environments with one interface: each adapter uses its library's calls.
 
-All have `reset(seed)`, `step(actions)`, `action_space` and `close()`. Those that have first-ready
-batches have `reset_async(seed)`, `recv(batch)` and `send(actions)` too, the latter for the
-environments of the last batch. Environments are shared evenly by the workers, in order.
+All have `reset(seed)`, `step(actions)`, `action_space` and `close()`. Adapters with first-ready
+batches also have `reset_async(seed)`, `recv(batch)` and `send(actions)`, the latter for the
+environments of the last batch. Workers share environments evenly, in order.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ Make = Callable[[], Any]
 
 
 def start(contender: str, make: Make, count: int, workers: int | None, batch: int) -> Any:
-    """The contender's vector of so many environments.
+    """Return the contender's vector of so many environments.
 
-    `workers`: None for one a processor; no matter where each environment has a worker or none has.
+    `workers`: None for one a processor; ignored if each environment has a worker or none has.
     `batch`: the size of first-ready batches, 0 for a vector that is stepped as a whole.
     """
     if not workers:
-        # A power of two, as the counts are: not everyone can share environments unevenly.
+        # A power of two, as the counts are: not all libraries can share environments unevenly.
         processors = import_module("fiber").cpu_count()
         workers = min(count, 1 << processors.bit_length() - 1)
     return _ADAPTERS[contender](make, count, workers, batch)
@@ -43,7 +43,7 @@ def _sync(make: Make, count: int, workers: int, batch: int) -> Any:
 
 
 class _SubprocVecEnv:
-    """stable-baselines3's. Forked, as AsyncVectorEnv's: a server's would import all anew."""
+    """stable-baselines3's vector. Forked, as AsyncVectorEnv's: a server's would import all anew."""
 
     def __init__(self, make: Make, count: int, workers: int, batch: int) -> None:
         vec_env = import_module("stable_baselines3.common.vec_env")
@@ -59,7 +59,7 @@ class _SubprocVecEnv:
 
 
 class _PufferLib:
-    """Its backend Multiprocessing, allowed more workers than there are cores where all have so."""
+    """PufferLib's backend Multiprocessing, allowed more workers than cores as all are here."""
 
     def __init__(self, make: Make, count: int, workers: int, batch: int) -> None:
         vector = import_module("pufferlib.vector")
@@ -90,20 +90,20 @@ class _PufferLib:
 
 
 class _RayActors:
-    """An actor for each worker, which has its environments in Gymnasium's SyncVectorEnv."""
+    """Actor for each worker, which has its environments in Gymnasium's SyncVectorEnv."""
 
     def __init__(self, make: Make, count: int, workers: int, batch: int) -> None:
         self._ray = peers.ray(workers)
         vector, self._numpy = import_module("gymnasium.vector"), import_module("numpy")
         self._each = count // workers
         actor = self._ray.remote(num_cpus=0)(vector.SyncVectorEnv)
-        # Without a copy of their own, as Ray makes one of what leaves the actor.
+        # Without a copy here, since Ray copies what leaves the actor.
         self._actors = [actor.remote([make] * self._each, copy=False) for _ in range(workers)]
         space = make().action_space
         self.action_space = import_module("gymnasium.vector.utils").batch_space(space, count)
         self._under_way: dict[Any, Any] = {}
         self._ready: list[Any] = []
-        self.reset(seed=0)  # which waits until all are there, as others do
+        self.reset(seed=0)  # which waits until all are ready, as others do
 
     def reset(self, seed: int) -> None:
         self._ray.get(self._reset(seed))
@@ -137,13 +137,13 @@ class _RayActors:
         return [actor.step.remote(part) for actor, part in zip(actors, parts, strict=True)]
 
     def _joined(self, results: list[Any]) -> tuple[Any, ...]:
-        """Observations, and unless there is one of a reset, rewards and endings; not infos."""
+        """Return observations and, unless after a reset, rewards and endings; no infos."""
         columns = zip(*(result[:-1] for result in results), strict=False)
         return tuple(self._numpy.concatenate(column) for column in columns)
 
 
 class _EnvPool:
-    """Environments in C++ and threads of this process: it has none of Python's, but a CartPole."""
+    """Environments in C++ and threads of this process: none of Python's, but a CartPole."""
 
     def __init__(self, make: Make, count: int, workers: int, batch: int) -> None:
         if make is not cart_pole:

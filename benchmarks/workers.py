@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 
 TITLE = "Many workers"
 ABOUT = """\
-What one worker costs the master until it is ready, in a pool of so many: processor time of the
-whole process, from the call of `Pool(n)` until the last worker has said that it is ready, less
-that of a pool of one, by the n - 1 others. The master is real, with its runtime, pool and
-scheduler; its one agent is an object that answers at once, and its workers are objects too, so
-that nothing else than the master is measured, and thousands fit here. What these objects cost is
-contained, and the same for each. Small pools are started up to 30 times; then the median counts."""
+Cost of one worker for the master until it is ready, in a pool of n. It is the processor time of the
+whole process from the call of `Pool(n)` until the last worker is ready, less that of a pool of one,
+divided by the n - 1 others. The master is real, with its runtime, pool and scheduler. Its one agent
+is an object that answers at once, and its workers are objects too. So only the master is measured,
+and thousands of workers fit here. The objects' cost is included, and the same for each. Small pools
+are started up to 30 times, and the median counts."""
 
 COST = Metric("cost", "processor time a worker", "s")
 WORKERS = (10, 1000, 5000)
@@ -31,12 +31,12 @@ _PATIENCE = 100.0
 
 
 def workers(count: int) -> str:
-    """The name of the case with so many."""
+    """Return the name of the case with so many."""
     return f"a pool of {count:,}"
 
 
 def cases(size: float) -> list[Case]:
-    """The full measure at size 1; below, smaller pools in the larger cases' places."""
+    """Return the full measure at size 1; below, smaller pools in the larger cases' places."""
     numbers = {n: max(10, round(n * size)) for n in WORKERS}
     return [
         Case(
@@ -55,7 +55,7 @@ def cases(size: float) -> list[Case]:
 
 
 def run(bench: Bench, workers: int, pools: int) -> dict[str, float]:
-    """Seconds of a processor for one worker, from so many pools of so many."""
+    """Return processor seconds for one worker, from so many pools of so many."""
     from benchmarks.fake_agents import FakeAgent, FakeBackend, TaskRunner
 
     from fiber._runtime.state import runtime, shutdown
@@ -74,7 +74,7 @@ def run(bench: Bench, workers: int, pools: int) -> dict[str, float]:
 
 
 def _one_pool(bench: Bench, agent: FakeAgent, workers: int) -> float:
-    """Seconds of a processor until all of them are ready."""
+    """Return processor seconds until all of them are ready."""
     all_ready = threading.Event()
     left = iter(range(workers - 1, -1, -1))
 

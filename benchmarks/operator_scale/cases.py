@@ -1,6 +1,6 @@
-"""What is compared: pools and ReplicaSets of the same pods, in the same numbers.
+"""Cases: pools and ReplicaSets of the same pods, in the same numbers.
 
-Plain data and decisions on it; nothing here talks to a cluster.
+Plain data and decisions on it; this module talks to no cluster.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ _LABEL = f"{names.GROUP}/benchmark-set"
 
 @dataclass(frozen=True)
 class Case:
-    """So many objects with so many pods each, `rounds` times if nothing else is asked for.
+    """Case of so many objects with so many pods each, done `rounds` times by default.
 
-    `limit`: seconds that each step of a trial may take.  `by_default`: whether ReplicaSets are
-    also measured as Kubernetes' defaults make them.
+    `limit`: seconds that each step of a trial may take. `by_default`: also measure ReplicaSets as
+    Kubernetes' defaults make them.
     """
 
     name: str
@@ -35,7 +35,7 @@ class Case:
 
     @property
     def pods(self) -> int:
-        """All of them."""
+        """Pods of all objects."""
         return self.objects * self.size
 
 
@@ -44,18 +44,18 @@ CASES = {
     for case in (
         Case("1000", "1,000 pods", 1, 1000, rounds=3, limit=120, by_default=True),
         Case("100x10", "100 times 10 pods", 100, 10, rounds=2, limit=120, by_default=True),
-        # The last, as what the operator's memory grew to does not shrink by itself.
+        # The last, because the operator's memory does not shrink after it has grown.
         Case("5000", "5,000 pods", 1, 5000, rounds=1, limit=400),
     )
 }
 
 WARM_UP = Case("warm-up", "50 pods to warm up", 1, 50, rounds=1, limit=60)
-"""Done first and not kept: connections are open and code is loaded when it counts."""
+"""Case that runs first and is not kept: it opens connections and loads code."""
 
 
 @dataclass(frozen=True)
 class Subject:
-    """One of those that make pods. `group` is the API's path before the namespace."""
+    """Kind of object that makes pods. `group` is the API's path before the namespace."""
 
     name: str
     label: str
@@ -65,12 +65,12 @@ class Subject:
     manifest: Callable[[str, int], Body]
 
     def collection(self, namespace: str) -> str:
-        """The path of all of them in a namespace."""
+        """Return the path of all of them in a namespace."""
         return f"{self.group}/namespaces/{namespace}/{self.resource}"
 
 
 def pod_template() -> Body:
-    """A pod that lands on a pretended node, where its image is never pulled."""
+    """Return a pod that lands on a pretended node, where its image is never pulled."""
     return {
         "metadata": {"labels": {_LABEL: "pods"}},
         "spec": {
@@ -130,23 +130,24 @@ REPLICA_SET = Subject(
 SUBJECTS = (FIBER, REPLICA_SET)
 
 DEFAULT_RATE = 20
-"""Calls a second that a controller of Kubernetes makes unless it is told otherwise."""
+"""Calls a second that a controller of Kubernetes makes by default."""
 BY_DEFAULT = replace(REPLICA_SET, name="replicaset-20", label=f"ReplicaSet at {DEFAULT_RATE}")
-"""The same at that rate, once a case: it takes what it takes."""
+"""ReplicaSets at that rate, once for each case, however long it takes."""
 
 
 def in_turn(turn: int) -> tuple[Subject, ...]:
-    """Both, the one or the other first, so that neither always finds the cluster as it likes."""
+    """Return both subjects in an alternating order, so that neither always has the fresher
+    cluster."""
     return SUBJECTS if turn % 2 == 0 else SUBJECTS[::-1]
 
 
 def ready(body: Body) -> int:
-    """How many ready pods the object's own status tells of."""
+    """Return the number of ready pods by the object's own status."""
     return int(body.get("status", {}).get("readyReplicas") or 0)
 
 
 def is_settled(body: Body, replicas: int) -> bool:
-    """Whether its own status says that so many are there, are ready, and that this is all."""
+    """Tell whether the object's own status has so many pods, all ready, and no others."""
     status = body.get("status", {})
     counts = {int(status.get(name) or 0) for name in ("replicas", "readyReplicas")}
     seen = status.get("observedGeneration") == body["metadata"]["generation"]

@@ -1,4 +1,4 @@
-"""The command line: choose, run in turns, report."""
+"""Command line: choose, run in turns, report."""
 
 from __future__ import annotations
 
@@ -47,19 +47,20 @@ _TROUBLE = (
     OSError,
     http.client.HTTPException,
     subprocess.TimeoutExpired,
-    AssertionError,  # the operator that was set up did not get ready; its log is in the message
+    AssertionError,  # the operator that was set up did not get ready; the message has its log
 )
 _PODS_OF_A_NODE = 500
 
 
 def main(arguments: Sequence[str]) -> int:
-    """0 if all was measured, 1 if something was in the way, 130 after Ctrl-C."""
+    """Return 0 if all was measured, 1 if an obstacle stopped it, 130 after Ctrl-C."""
     options = _parse(arguments)
     return guarded(lambda stack: _run(stack, options, " " + shlex.join(arguments)))
 
 
 def guarded(measure: Callable[[contextlib.ExitStack], Callable[[], None]]) -> int:
-    """Measure, remove what was made, and then do what `measure` has returned: write the results."""
+    """Measure, remove the objects that were made, and then do what `measure` returned: write the
+    results."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _interrupt)
     try:
@@ -95,7 +96,8 @@ def _write(output: Path, found: dict[str, Result]) -> None:
 def prepared(
     stack: contextlib.ExitStack, pods: int, set_up: bool, arguments: str
 ) -> tuple[Kube, Operator, dict[str, Any]]:
-    """Return a cluster that has room for so many pods, its operator, and what they run on."""
+    """Return a cluster that has room for so many pods, its operator, and facts about its
+    machine."""
     kubeconfig = (
         stack.enter_context(preparation.own_cluster(-(-pods // _PODS_OF_A_NODE)))
         if set_up
@@ -106,7 +108,7 @@ def prepared(
         stack.enter_context(preparation.operator(kube))
     operator, nodes = find_operator(kube), check_nodes(kube, pods)
     trial.remove_namespaces(kube)  # of a run that was killed
-    # Once more at the end, in case that what removes a trial's is itself interrupted.
+    # Once more at the end, because the removal of a trial's objects can be interrupted.
     stack.callback(trial.remove_namespaces, kube)
     return kube, operator, _about(kube, operator, nodes, arguments)
 
@@ -126,7 +128,7 @@ def _play(
                 say(f"round {turn + 1}/{rounds}: {case.title}, {subject.label}")
                 result.trials.append(_visit(kube, operator, case, subject, turn))
     slow = [case for case in options.cases if case.by_default]
-    if slow and options.set_up:  # nobody else's cluster is started again for it
+    if slow and options.set_up:  # a cluster of other people is not started again for this
         with preparation.default_rate():
             trial.run(kube, operator, WARM_UP, BY_DEFAULT, 0)
             for case in slow:
@@ -145,9 +147,9 @@ def _visit(kube: Kube, operator: Operator, case: Case, subject: Subject, turn: i
 
 @contextlib.contextmanager
 def open_api(kubeconfig: Path) -> Iterator[Kube]:
-    """The cluster's API, also while a Ctrl-C is answered."""
-    # What it starts must outlive a Ctrl-C, which a terminal sends to all of us: it is needed to
-    # remove everything.
+    """Client of the cluster's API, also while a Ctrl-C is answered."""
+    # Its processes must outlive a Ctrl-C, which a terminal sends to all of the group: they remove
+    # the objects.
     handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         kube = Kube(kubeconfig)
@@ -168,7 +170,7 @@ def open_api(kubeconfig: Path) -> Iterator[Kube]:
 
 
 def _interrupt(*_: object) -> None:
-    # A second one must not keep what was made from being removed.
+    # A second one must not stop the removal.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     say("interrupted: removing what was made, which takes up to a minute or two")
@@ -197,14 +199,14 @@ def _parse(arguments: Sequence[str]) -> argparse.Namespace:
         type=_cases,
         default=list(CASES.values()),
         metavar="A,B",
-        help=f"any of {','.join(CASES)}; all if not given",
+        help=f"any of {','.join(CASES)}; default: all",
     )
-    parser.add_argument("--rounds", type=_count, help="of each case, in place of its own number")
+    parser.add_argument("--rounds", type=_count, help="of each case; default: the case's")
     parser.add_argument(
         "--set-up",
         action="store_true",
         help="bring up the cluster of tests/cluster, pretended nodes and the operator where they "
-        "are missing, and take away at the end what was made",
+        "are missing, and remove at the end what was made",
     )
     parser.add_argument("--output", type=Path, default=ROOT / "docs" / "benchmarks")
     return parser.parse_args(arguments)

@@ -1,4 +1,4 @@
-"""Prometheus' pages: what they count, and by how much it grew.  Arithmetic on text."""
+"""Prometheus' pages: their counters, and by how much these grew. Arithmetic on text."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _LABEL = re.compile(r'(\w+)="((?:[^"\\]|\\.)*)"')
 _OPERATOR_REQUESTS = "fiber_operator_api_requests_total"
 _SERVER_REQUESTS = "apiserver_request_total"
 _WRITES = {"POST", "PUT", "PATCH", "DELETE", "DELETECOLLECTION", "APPLY"}
-# What nodes and components write all the time, whoever makes pods.
+# Objects that nodes and components write all the time, independent of the pods.
 _HEARTBEATS = {"leases", "nodes"}
 
 STATUS_WRITES = "patch fiberpools/status"
@@ -20,21 +20,21 @@ Counts = Mapping[str, float]
 
 
 def samples(page: str, name: str) -> Iterator[tuple[dict[str, str], float]]:
-    """Labels and value of each sample of a metric."""
+    """Yield labels and value of each sample of a metric."""
     for line in page.splitlines():
         if line.startswith(name) and (found := _SAMPLE.match(line)) and found[1] == name:
             yield dict(_LABEL.findall(found[2] or "")), float(found[3])
 
 
 def value(page: str, name: str) -> float:
-    """The one value of a metric without labels. Raises KeyError where there is none."""
+    """Return the one value of a metric without labels. Raises KeyError if there is none."""
     for _, number in samples(page, name):
         return number
     raise KeyError(name)
 
 
 def operator_requests(page: str) -> Counts:
-    """The operator's own requests, as "verb resource"."""
+    """Return the operator's own requests, as "verb resource"."""
     counts: defaultdict[str, float] = defaultdict(float)
     for labels, number in samples(page, _OPERATOR_REQUESTS):
         counts[f"{labels['verb']} {labels['resource']}"] += number
@@ -42,7 +42,7 @@ def operator_requests(page: str) -> Counts:
 
 
 def server_writes(page: str) -> Counts:
-    """What everybody together has written at the API server, as "VERB resource"."""
+    """Return all writes of all clients at the API server, as "VERB resource"."""
     counts: defaultdict[str, float] = defaultdict(float)
     for labels, number in samples(page, _SERVER_REQUESTS):
         if labels["verb"] in _WRITES and labels["resource"] not in _HEARTBEATS:
@@ -52,7 +52,8 @@ def server_writes(page: str) -> Counts:
 
 
 def growth(before: Counts, after: Counts) -> dict[str, float]:
-    """What has come, the most first; what has not grown is left out."""
+    """Return the growth of each counter, the largest first; counters that did not grow are left
+    out."""
     grown = {key: number - before.get(key, 0) for key, number in after.items()}
     ordered = sorted(grown.items(), key=lambda found: (-found[1], found[0]))
     return {key: number for key, number in ordered if number > 0}

@@ -1,7 +1,7 @@
 """`python -m benchmarks.operator_scale.floods`: one namespace floods the operator, another waits.
 
-In the healthy namespace a FiberPool is scaled between one pod and two. How long its status takes
-to say so is measured without a flood, and beside each flood of another namespace.
+In the healthy namespace a FiberPool is scaled between one pod and two. The delay until its status
+says so is measured without a flood, and beside each flood of another namespace.
 """
 
 from __future__ import annotations
@@ -45,21 +45,21 @@ RESULTS, PAGE = "operator-floods.json", "operator-floods.md"
 
 @dataclass(frozen=True)
 class Flood:
-    """Pools that a namespace is filled with, and what is written there again and again."""
+    """Flood: pools that fill a namespace, and what is written there again and again."""
 
     title: str
     write: Callable[[Kube, str, int], object] | None = None
-    """Called with the namespace and a number that grows."""
+    """Function that is called with the namespace and a number that grows."""
     pools: Sequence[Body] = ()
 
 
 @dataclass
 class Measured:
-    """What one flood did."""
+    """Effect of one flood."""
 
     delays: list[float] = field(default_factory=list)
     changes: int = 0
-    """Made by the flood meanwhile."""
+    """Changes that the flood made meanwhile."""
     seconds: float = 0.0
     memory: float = 0.0
     """The operator's resident memory at its peak, in bytes."""
@@ -85,7 +85,7 @@ def _broken(name: str) -> Body:
 
 
 def _filled(title: str, make: Callable[[str], Body], pools: int, change: Change) -> Flood:
-    """A flood of so many pools, which are changed in turn."""
+    """Return a flood of so many pools, which are changed in turn."""
 
     def write(kube: Kube, namespace: str, number: int) -> None:
         kube.patch(f"{FIBER.collection(namespace)}/flood-{number % pools:03}", change(number))
@@ -222,7 +222,7 @@ _ABOUT = (
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Return 0 if all was measured, 1 if something was in the way, 130 after Ctrl-C."""
+    """Return 0 if all was measured, 1 if an obstacle stopped it, 130 after Ctrl-C."""
     parser = argparse.ArgumentParser(
         "benchmarks.operator_scale.floods",
         description="Measure how long one namespace waits while another floods the operator.",

@@ -1,4 +1,4 @@
-"""What must be in the cluster before anything is measured, and the operator that is there."""
+"""Prerequisites that must be in the cluster before a measurement, and the running operator."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ _PAUSE = 0.5
 
 
 class CannotMeasure(Exception):
-    """The message says what is missing, why it is needed, and what to do."""
+    """Missing prerequisite: the message says what is missing, why it is needed, and what to do."""
 
 
 class Operator:
-    """The cluster's one operator."""
+    """Cluster's one operator."""
 
     def __init__(self, kube: Kube, pod: Body) -> None:
         self._kube = kube
@@ -38,13 +38,13 @@ class Operator:
 
     @property
     def image(self) -> str:
-        """What it runs."""
+        """Image that it runs."""
         return str(self._container["image"])
 
     def page(self) -> str:
-        """Its metrics now."""
+        """Return its metrics now."""
         metadata = self._pod["metadata"]
-        # By number: unlike a Service's, the proxy of a pod knows no names of ports.
+        # By number: a pod's proxy, unlike a Service's, knows no names of ports.
         ports = {port["name"]: port["containerPort"] for port in self._container["ports"]}
         place = f"{metadata['name']}:{ports['metrics']}"
         return self._kube.text(path_of("pods", metadata["namespace"], place, "proxy/metrics"))
@@ -55,12 +55,12 @@ class Operator:
         return next(each for each in containers if each["name"] == "operator")
 
     def born(self, page: str) -> float:
-        """Tells a process from the one that took its place."""
+        """Identity that tells a process from the one that took its place."""
         return counters.value(page, _STARTED)
 
     @contextlib.contextmanager
     def memory(self, since: float) -> Iterator[Curve]:
-        """Its resident memory while this lasts, by a clock that stood at 0 at `since`."""
+        """Record its resident memory while the block runs, by a clock that was 0 at `since`."""
         curve: Curve = []
         ended = threading.Event()
         thread = threading.Thread(target=self._watch, args=(curve, since, ended), daemon=True)
@@ -76,12 +76,12 @@ class Operator:
             try:
                 size = counters.value(self.page(), MEMORY)
             except (OSError, http.client.HTTPException, Refused, KeyError):
-                continue  # that it was away shows at the end: another process has its place
+                continue  # away for a moment; the end shows if another took its place
             curve.append([time.monotonic() - since, size])
 
 
 def find_operator(kube: Kube) -> Operator:
-    """The operator, which must be there, be alone and be ready."""
+    """Return the operator, which must be installed, the only one, and ready."""
     if kube.get(path_of("customresourcedefinitions", name=names.CRD_NAME)) is None:
         raise CannotMeasure(
             f"the cluster does not know FiberPools (no {names.CRD_NAME}): install the chart "
@@ -104,7 +104,7 @@ def find_operator(kube: Kube) -> Operator:
 
 
 def check_nodes(kube: Kube, pods: int) -> int:
-    """How many pretended nodes there are; together they must take so many pods."""
+    """Return the number of pretended nodes; together they must take so many pods."""
     nodes = kube.items("/api/v1/nodes", labelSelector=f"{FAKE_KEY}={FAKE_VALUE}")
     fit = [node for node in nodes if is_ready(node)]
     room = sum(int(node["status"]["allocatable"]["pods"]) for node in fit)
@@ -121,6 +121,6 @@ def check_nodes(kube: Kube, pods: int) -> int:
 
 
 def server_version(kube: Kube) -> str:
-    """The API server's."""
+    """Return the API server's version."""
     found: dict[str, Any] = kube.call("GET", "/version")
     return str(found["gitVersion"])

@@ -1,4 +1,4 @@
-"""The picture: how pods become ready, and what memory the operator uses meanwhile."""
+"""Picture: how pods become ready, and the operator's memory meanwhile."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _SHADES = ("#d62728", "#ff9896", "#8c2d04")
 
 
 def draw(known: Mapping[str, Result], path: Path) -> None:
-    """A panel for each case, and one for the operator's memory in all of them."""
+    """Draw a panel for each case, and one for the operator's memory in all of them."""
     figure, panels = plt.subplots(1, len(known) + 1, figsize=(4.2 * (len(known) + 1), 4.4))
     for panel, (name, result) in zip(panels, known.items(), strict=False):
         _growth(panel, name, result)

@@ -1,6 +1,6 @@
 """`--set-up`: the cluster of tests/cluster with pretended nodes and the operator, for one run.
 
-What was there before is used and stays; what was made here goes at the end.
+Parts that existed before are used and stay; parts that are made here are removed at the end.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _VALUES = {"operator": {"leaseSeconds": 15}}
 
 
 def kubeconfig() -> Path:
-    """What KUBECONFIG names."""
+    """Return the file that KUBECONFIG names."""
     given = os.environ.get("KUBECONFIG")
     if not given:
         raise CannotMeasure(
@@ -41,7 +41,7 @@ def kubeconfig() -> Path:
 
 @contextlib.contextmanager
 def own_cluster(fakes: int) -> Iterator[Path]:
-    """Our cluster with so many pretended nodes; gives its KUBECONFIG."""
+    """Bring up our cluster with so many pretended nodes; give its KUBECONFIG."""
     given = os.environ.get("KUBECONFIG")
     if given and Path(given) != places.KUBECONFIG:
         raise CannotMeasure(
@@ -72,7 +72,7 @@ def own_cluster(fakes: int) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def default_rate() -> Iterator[None]:
-    """Kubernetes' controllers make no more calls a second meanwhile than by default."""
+    """Limit Kubernetes' controllers to the calls a second that they make by default."""
     try:
         control_plane.limit_controllers(DEFAULT_RATE)
         yield
@@ -82,10 +82,10 @@ def default_rate() -> Iterator[None]:
 
 @contextlib.contextmanager
 def operator(kube: Kube) -> Iterator[None]:
-    """The operator of this checkout, unless the cluster has one already."""
+    """Install the operator of this checkout, unless the cluster has one already."""
     owner = crd_owner(kube)
     if owner is not None and owner != f"{_RELEASE}/{_RELEASE}":
-        yield  # whether it runs is found out by who looks for it
+        yield  # its caller finds out whether it runs
         return
     with tempfile.TemporaryDirectory() as home:
         release = Release(kube, _RELEASE, _RELEASE, images.bring_images(), Path(home))

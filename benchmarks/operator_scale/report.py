@@ -1,4 +1,4 @@
-"""From results to the page, its picture and the file with every sample."""
+"""Page, picture and file with every sample, from the results."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ NOTES = "operator-notes.md"
 
 MEMORY_CASE = "1000"
 MOST_TIMES = {REPLICA_SET.name: 1.2, BY_DEFAULT.name: 1.0}
-"""Of their time until settled."""
+"""Ratio of the times until settled."""
 MOST_MEMORY = 150 * MEGA
 
 Words = Callable[[float], str]
 
 _TITLE = "The operator at thousands of pods"
 _FEW = 0.005
-"""Requests per pod; what is less is not shown."""
+"""Requests per pod; smaller numbers are not shown."""
 
 
 @dataclass(frozen=True)
 class Line:
-    """A budget and what was measured."""
+    """Budget and its measured value."""
 
     what: str
     measured: str
@@ -50,7 +50,7 @@ class Line:
 
 
 def write(folder: Path, known: Mapping[str, Result]) -> None:
-    """All three, and the cases in their order."""
+    """Write all three, with the cases in their order."""
     folder.mkdir(parents=True, exist_ok=True)
     ordered = {name: known[name] for name in CASES if name in known}
     results.save(folder / RESULTS, ordered)
@@ -60,7 +60,7 @@ def write(folder: Path, known: Mapping[str, Result]) -> None:
 
 
 def budgets(known: Mapping[str, Result]) -> list[Line]:
-    """The operator's budgets of the design: of each case, and of its memory in one."""
+    """Return the operator's budgets of the design: of each case, and of its memory in one."""
     in_time = [
         _settled(case, other, known.get(name, Result({})))
         for other in (REPLICA_SET, BY_DEFAULT)
@@ -91,13 +91,13 @@ def _line(what: str, value: float | None, bound: float, words: Words) -> Line:
 
 
 def page(known: Mapping[str, Result], *, notes: bool) -> str:
-    """The page of these results."""
+    """Return the page of these results."""
     parts = [
         "<!-- Written by benchmarks/operator_scale from operator.json; changes made by hand are "
         "lost. -->",
         f"# {_TITLE}",
         _ABOUT,
-        f"Why it is as it is, and what was tried: [notes]({NOTES})." if notes else "",
+        f"Reasons, and what was tried: [notes]({NOTES})." if notes else "",
         f"![{_TITLE}]({PICTURE})",
         "## Budgets",
         table(
@@ -117,13 +117,13 @@ def page(known: Mapping[str, Result], *, notes: bool) -> str:
             _uses(known),
         ),
         "## Its requests until settled",
-        "Pods made, pools read, statuses written: all that it asked of the API server, by verb and "
-        "resource. In the median trial, and for each pod.",
+        "All requests of the operator to the API server, by verb and resource: pods made, pools "
+        "read, statuses written. In the median trial, and for each pod.",
         table(("pods", "request", "number", "for each pod"), _requests(known)),
         "## Writes at the API server until settled",
-        "By everybody: who makes the pods, the scheduler, the pretended nodes; without heartbeats. "
-        "For each pod, in the median trial.",
-        table(("pods", "who makes them", "all", "the most frequent"), _writes(known)),
+        "By all writers: the maker of the pods, the scheduler, the pretended nodes; without "
+        "heartbeats. For each pod, in the median trial.",
+        table(("pods", "maker", "all", "the most frequent"), _writes(known)),
         "## Made on",
         *_origins(known),
     ]
@@ -134,24 +134,23 @@ _ABOUT = (
     "One FiberPool of 1,000 pods and one of 5,000, and 100 of 10 pods each, beside ReplicaSets of "
     "the same sizes with the same pod template, on nodes that only pretend to run pods (KWOK). "
     "The API server, etcd, the scheduler and the operator are real, and all of them share the "
-    "machine's processors: it is the ratio that counts. `make bench-operator` writes this page. "
+    "machine's processors, so the ratio counts. `make bench-operator` writes this page. "
     "How the operator serves one namespace while another floods it: [floods](operator-floods.md)."
 )
 _TIME = (
-    "A round measures both, one after the other, in an order that alternates; each has a "
-    "namespace of its own, and the next one begins when nothing is left of it. Medians of the "
-    "rounds; the ratio is taken within each round. ReplicaSets are measured with a controller that "
-    "may make 1,000 calls a second, so that it is its work that counts, and once with Kubernetes' "
-    f"default of {DEFAULT_RATE}. What is settled, an object's own status says: it is about this "
-    "spec, and as many pods are ready as are wanted. Pods are counted ten times a second. A "
-    "deleted object's pods are removed by Kubernetes' garbage collector, which keeps to the same "
-    "rate."
+    "A round measures both, one after the other, in an order that alternates. Each has a separate "
+    "namespace, and the next one begins when it is gone. The tables show medians of the rounds; "
+    "the ratio is taken within each round. ReplicaSets are measured with a controller that may "
+    "make 1,000 calls a second, so that its work counts, and once with Kubernetes' default of "
+    f"{DEFAULT_RATE}. An object is settled when its own status says so: the status is about this "
+    "spec, and as many pods are ready as are wanted. Pods are counted ten times a second. "
+    "Kubernetes' garbage collector removes a deleted object's pods, at the same rate of calls."
 )
 _NEEDS = (
-    "Of the operator's own metrics: resident memory, looked at twice a second, and processor "
-    "time. Medians, but the peak is the greatest of all rounds. Before: when the trial begins; "
-    "after: when all of its pods are gone. What a Python process took once it seldom gives back, "
-    "so cases that ran earlier show in what is there before."
+    "From the operator's own metrics: resident memory, read twice a second, and processor time. "
+    "Medians, but the peak is the greatest of all rounds. Before: when the trial begins; after: "
+    "when all of its pods are gone. A Python process seldom returns memory, so earlier cases show "
+    "in the memory before."
 )
 
 
@@ -246,7 +245,7 @@ def _middle(result: Result) -> OperatorUse | None:
 
 
 def _origins(known: Mapping[str, Result]) -> Iterator[str]:
-    """Where and when; cases that were measured by the same command share a table."""
+    """Return where and when; cases that were measured by the same command share a table."""
     made: dict[str, list[str]] = {}
     for case, result in _rows(known):
         about = {name: value for name, value in result.about.items() if name != "rounds"}

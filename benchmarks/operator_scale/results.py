@@ -1,4 +1,4 @@
-"""What was measured, as plain data that a file can keep."""
+"""Results as plain data that a file can keep."""
 
 from __future__ import annotations
 
@@ -19,34 +19,34 @@ STEPS = {
     "halved": "scaled to half: as many are gone, and the status says so",
     "gone": "deleted: no pod is left",
 }
-"""The steps of a trial, in order; each is timed from when it was asked for."""
+"""Steps of a trial, in order; each is timed from when it was asked for."""
 
 MEGA = 1e6
 
 
 @dataclass
 class OperatorUse:
-    """What one trial cost the operator."""
+    """Cost of one trial for the operator."""
 
     memory: Curve = field(default_factory=list)
     memory_before: float = 0.0
     memory_after: float = 0.0
     seconds_until_settled: float = 0.0
-    """Of a processor."""
+    """Seconds of a processor."""
     seconds: float = 0.0
-    """Of a processor, for all of the trial."""
+    """Seconds of a processor, for all of the trial."""
     requests_until_settled: dict[str, float] = field(default_factory=dict)
     requests_after: dict[str, float] = field(default_factory=dict)
 
     @property
     def peak(self) -> float:
-        """The most resident memory that was seen."""
+        """Most resident memory that was seen."""
         return max((size for _, size in self.memory), default=self.memory_after)
 
 
 @dataclass
 class Trial:
-    """One case done once by one subject."""
+    """Trial: one case done once by one subject."""
 
     subject: str
     turn: int
@@ -54,12 +54,12 @@ class Trial:
     created: Curve = field(default_factory=list)
     ready: Curve = field(default_factory=list)
     writes: dict[str, float] = field(default_factory=dict)
-    """Until it was settled, by everybody, at the API server."""
+    """Writes of all clients at the API server, until the trial was settled."""
     operator: OperatorUse | None = None
 
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> Trial:
-        """The trial that `dataclasses.asdict` described."""
+        """Return the trial that `dataclasses.asdict` described."""
         use = data.get("operator")
         return cls(**{**data, "operator": OperatorUse(**use) if use else None})
 
@@ -72,19 +72,19 @@ class Result:
     trials: list[Trial] = field(default_factory=list)
 
     def of(self, subject: str) -> list[Trial]:
-        """Its trials, by round."""
+        """Return its trials, by round."""
         return sorted((t for t in self.trials if t.subject == subject), key=lambda t: t.turn)
 
     def step(self, subject: str, step: str) -> Summary | None:
-        """Median and spread of a step's seconds."""
+        """Return median and spread of a step's seconds."""
         return summary(self._series(subject, step))
 
     def ratio(self, subject: str, baseline: str, step: str) -> Summary | None:
-        """Of a step's seconds, within each round."""
+        """Return the ratio of a step's seconds, within each round."""
         return ratio(self._series(subject, step), self._series(baseline, step))
 
     def peak(self) -> float | None:
-        """The most memory that the operator used in any trial."""
+        """Return the most memory that the operator used in any trial."""
         peaks = [trial.operator.peak for trial in self.trials if trial.operator]
         return max(peaks, default=None)
 
@@ -95,7 +95,7 @@ class Result:
 
 
 def load(path: Path) -> dict[str, Result]:
-    """The results of earlier runs, by case, so that one case can be run again alone."""
+    """Return the results of earlier runs, by case, so that one case can be run again alone."""
     if not path.exists():
         return {}
     return {
@@ -105,13 +105,13 @@ def load(path: Path) -> dict[str, Result]:
 
 
 def save(path: Path, results: dict[str, Result]) -> None:
-    """Write them so that `load` gives them back."""
+    """Write them so that `load` returns them."""
     data = {name: dataclasses.asdict(result) for name, result in results.items()}
     path.write_text(json.dumps(_rounded(data), separators=(",", ":")) + "\n", encoding="utf-8")
 
 
 def _rounded(data: Any) -> Any:
-    """Milliseconds are fine enough, and keep the file small."""
+    """Round to milliseconds, which are fine enough and keep the file small."""
     if isinstance(data, float):
         return round(data, 3)
     if isinstance(data, dict):

@@ -1,7 +1,8 @@
-"""One trial: make the objects, wait, halve them, delete them, and measure all the while.
+"""Trial: make the objects, wait, halve them, delete them, and measure meanwhile.
 
-In a namespace of its own, which is deleted at the end whatever happens.  Pods are counted by
-asking for one of them: the API server adds how many more there are, which costs it next to nothing.
+A trial has a separate namespace, which is deleted at the end in any case. Pods are counted by
+asking for one of them: the API server adds the number of the others, which costs it next to
+nothing.
 """
 
 from __future__ import annotations
@@ -23,15 +24,15 @@ _PAUSE = 0.1
 """Seconds between two counts of the pods."""
 _END_LIMIT = 300.0
 _REST = 3.0
-"""Seconds after a trial: what was put off is done, and memory is what it will be."""
+"""Seconds after a trial until postponed work is done and memory has settled."""
 
 
 class TooSlow(Exception):
-    """A step was not done in time; the message says how far it was."""
+    """Step that was not done in time; the message says how far it was."""
 
 
 def run(kube: Kube, operator: Operator, case: Case, subject: Subject, turn: int) -> Trial:
-    """Do it, and leave nothing behind."""
+    """Do the trial, and leave nothing behind."""
     with namespace(kube, case.name) as name:
         trial = Trial(subject.name, turn)
         _Attempt(kube, operator, case, subject, name, trial).run()
@@ -55,9 +56,9 @@ def namespace(kube: Kube, word: str) -> Iterator[str]:
 
 
 def remove_namespaces(kube: Kube, name: str = "") -> None:
-    """Delete one, or all that trials ever left, and wait until they are gone.
+    """Delete one namespace, or all that trials ever left, and wait until they are gone.
 
-    By kubectl alone, which needs nothing that an interrupt may have ended.
+    By kubectl alone, which needs no process that an interrupt may have ended.
     """
     which = [name] if name else ["--selector", f"{LABEL}=true"]
     kube.kubectl("delete", "namespaces", *which, "--ignore-not-found", "--wait=false")
@@ -78,7 +79,7 @@ def _wait(what: str, done: Callable[[], bool], seconds: float, pause: float = _P
 
 
 class _Attempt:
-    """What one trial is made of."""
+    """State of one trial."""
 
     def __init__(
         self,
@@ -139,7 +140,7 @@ class _Attempt:
         return done == self._case.objects
 
     def _until(self, step: str, started: float, done: Callable[[], bool]) -> None:
-        """Wait, and note how long it took; meanwhile the pods are counted as long as it matters."""
+        """Wait, and note how long it took; count the pods meanwhile."""
         deadline = started + self._case.limit
         self._pods, due = -1, 0.0
         while True:

@@ -1,4 +1,4 @@
-"""The objects of one trial as their own statuses tell of them, kept up to date by a watch."""
+"""Objects of one trial by their own statuses, kept up to date by a watch."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from e2e.kube import Kube, Refused, Stream
 
 
 class Watched:
-    """All objects of a collection.  ``ready`` is the sum over them by time since ``since``."""
+    """All objects of a collection. ``ready`` is the sum over them by time since ``since``."""
 
     def __init__(self, kube: Kube, collection: str, since: float) -> None:
         self._kube = kube
@@ -35,7 +35,7 @@ class Watched:
             self._changed.wait(max(0.0, until - time.monotonic()))
 
     def count(self, condition: Callable[[Body], bool]) -> int:
-        """Of how many objects it is true."""
+        """Return the number of objects for which it is true."""
         with self._changed:
             return sum(condition(body) for body in self._objects.values())
 
