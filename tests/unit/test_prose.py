@@ -21,7 +21,7 @@ BADLY = re.compile(
 )
 
 VAGUE = re.compile(r"\b(whoever|whatever)\b", re.IGNORECASE)
-MOST_VAGUE = 40
+MOST_VAGUE = 200
 MOST_WORDS_OF_A_CELL = 40
 CELL_BORDER = re.compile(r"(?<!\\)\|")
 NAMED_MODULE = re.compile(r"`([\w/.-]*\w\.py)`")
@@ -54,7 +54,7 @@ def test_decision_records_have_four_parts_and_are_short(record: Path) -> None:
     assert f"| [{title}]({record.name}) |" in index
 
 
-@pytest.mark.parametrize("folder", ["benchmarks", "crds", "examples", "operator", "sdk"])
+@pytest.mark.parametrize("folder", ["benchmarks", "operator", "sdk"])
 def test_docstrings_begin_with_a_verb_or_a_noun(folder: str) -> None:
     paths = sorted((ROOT / folder).rglob("*.py"))
     assert paths
