@@ -21,7 +21,7 @@ BADLY = re.compile(
 )
 
 VAGUE = re.compile(r"\b(whoever|whatever)\b", re.IGNORECASE)
-MOST_VAGUE = 200
+MOST_VAGUE = 180
 MOST_WORDS_OF_A_CELL = 40
 CELL_BORDER = re.compile(r"(?<!\\)\|")
 NAMED_MODULE = re.compile(r"`([\w/.-]*\w\.py)`")
