@@ -189,6 +189,21 @@ def test_certificates_alone_are_public(tmp_path: Path) -> None:
     assert found(tmp_path / "all.pem")
 
 
+def test_many_certificates_are_public(tmp_path: Path) -> None:
+    many = CERTIFICATE * (2 * secret_files._HEAD // len(CERTIFICATE))
+    (tmp_path / "cacert.pem").write_text(many)
+    assert found(tmp_path / "cacert.pem") is None
+    (tmp_path / "all.pem").write_text(many + key())
+    assert found(tmp_path / "all.pem")
+
+
+def test_public_keys_are_public(tmp_path: Path) -> None:
+    (tmp_path / "jwt.pem").write_text(key().replace("PRIVATE", "PUBLIC"))
+    assert found(tmp_path / "jwt.pem") is None
+    (tmp_path / "jwt.pem").write_text("x")
+    assert found(tmp_path / "jwt.pem")
+
+
 def test_only_heads_of_small_files_are_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,6 +1,6 @@
 """Recognition of files that hold secrets: keys, passwords and tokens.
 
-The name of a file decides, or that of a folder around it, or the head of a small file.  Modules are
+The name of a file decides, or that of a folder around it, or the contents of a small file.  Modules are
 judged by their name alone: a program cannot run without its code.
 """
 
@@ -159,7 +159,7 @@ _SMALL = 1 << 20
 """Bytes of the largest file that is opened."""
 
 _HEAD = 64 << 10
-"""Bytes that are read of it."""
+"""Bytes that are read of it, unless its name says that it holds keys or certificates."""
 
 
 def _compiled(patterns: tuple[str, ...]) -> re.Pattern[str]:
@@ -205,19 +205,24 @@ def _by_name(name: str) -> str | None:
 
 
 _PUBLIC = "certificates"
+_BLOCK = re.compile(rb"^-----BEGIN [A-Z0-9 ]+-----", re.MULTILINE)
 
 
 @lru_cache(maxsize=1 << 16)
 def _by_contents(path: str, size: int, modified: int) -> str:
-    """Return what the head of the file shows; nothing if that is neither secret nor public."""
+    """Return what the file shows; nothing if that is neither secret nor public.
+
+    The head of a file shows secrets.  Only all of a ``*.pem`` file shows that it has none.
+    """
     try:
         # A pipe in its place meanwhile must not be waited for.
         with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
-            head = file.read(_HEAD) or b""  # None: a pipe with nothing in it
+            limit = _SMALL if path.lower().endswith(".pem") else _HEAD
+            head = file.read(limit) or b""  # None: a pipe with nothing in it
     except OSError:
         return ""  # what cannot be read is not sent
     for holds, needed in _BY_CONTENTS.items():
         if all(pattern.search(head) for pattern in needed):
             return holds
-    public = size <= _HEAD and b"-----BEGIN CERTIFICATE-----" in head and b"PRIVATE" not in head
+    public = size <= limit and _BLOCK.search(head) and b"PRIVATE" not in head
     return _PUBLIC if public else ""
