@@ -37,6 +37,15 @@ class FakeCluster:
 
         return asyncio.run_coroutine_threadsafe(call(), self._loop).result(PATIENCE)
 
+    def take_forced(self) -> list[str]:
+        """Return the pods whose agents had to be killed since the last call."""
+
+        def take() -> list[str]:
+            forced, self.nodes.forced = self.nodes.forced, []
+            return forced
+
+        return self.do(take)
+
     def objects(self, plural: str) -> list[Body]:
         """Those that are there, in all namespaces."""
         return self.do(self.world.store.list, plural)

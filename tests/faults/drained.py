@@ -149,7 +149,7 @@ def site(request: pytest.FixtureRequest, grace: float, settings: dict[str, Any])
         cluster = request.getfixturevalue("played_cluster")
         with on_pods(cluster, grace, settings) as pods:
             yield pods
-        assert cluster.nodes.forced == []
+        assert cluster.take_forced() == []
 
 
 patient = pytest.mark.parametrize("grace", [PATIENT])

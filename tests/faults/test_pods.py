@@ -59,7 +59,7 @@ def _nothing_is_left(cluster: FakeCluster) -> Iterator[None]:
         return {object_["metadata"]["name"] for object_ in found} - OPERATORS
 
     cluster.wait(lambda: not left())
-    assert cluster.nodes.forced == []
+    assert cluster.take_forced() == []
 
 
 def pods_of(cluster: FakeCluster) -> list[str]:
@@ -574,3 +574,9 @@ def test_pods_dial_the_advertised_address(cluster: FakeCluster) -> None:
         (found,) = cluster.objects("fiberpools")
         assert found["spec"]["master"]["host"] == here
         assert forwarding.connections > 0
+
+
+def test_an_agent_that_was_killed_fails_one_test_alone(cluster: FakeCluster) -> None:
+    cluster.do(cluster.nodes.forced.append, "es-0123456789")
+    assert cluster.take_forced() == ["es-0123456789"]
+    assert cluster.take_forced() == []
