@@ -12,6 +12,7 @@ import pytest
 
 from e2e.accounts import may_use_pools
 from e2e.clusters import Cluster, NoCluster, choose
+from e2e.cordons import uncordon
 from e2e.delays import measured, report
 from e2e.kube import Body, Kube, path_of
 from e2e.pools import Pool, template
@@ -80,6 +81,7 @@ def release(
             pytrace=False,
         )
     release = Release(kube, RELEASE, RELEASE, cluster.images, tmp_path_factory.mktemp("helm"))
+    uncordon(kube)
     _remove_namespaces(kube)
     release.uninstall()  # of a session that was killed, perhaps while Helm was at work
     # Where the last session ended just now it is about to go, and takes nothing in.

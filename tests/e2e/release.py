@@ -53,9 +53,11 @@ class Release:
         self.wait_until_ready()
 
     def render(self, values: Values) -> str:
-        """The manifests that it would install."""
+        """The manifests that it would install, without those that `helm test` makes for itself."""
         version = self._kube.call("GET", "/version")["gitVersion"]
-        return self._with_values("template", "--kube-version", version, values=values)
+        return self._with_values(
+            "template", "--skip-tests", "--kube-version", version, values=values
+        )
 
     def _with_values(self, *command: str, values: Values) -> str:
         with tempfile.NamedTemporaryFile("w", suffix=".json", dir=self._home) as file:

@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 
 from e2e.clusters import Cluster
-from e2e.kube import Body
+from e2e.cordons import cordoned, uncordon
+from e2e.kube import Body, Kube
 from e2e.leftovers import leaves_nothing
 from e2e.pools import Pool, is_ready
 from e2e.program import Program, Programs
@@ -36,12 +37,10 @@ def drained(scene: Scene, node: str) -> Iterator[set[str]]:
     pods = {pod["metadata"]["name"] for pod in workers(scene) if pod["spec"]["nodeName"] == node}
     # The workers alone: the operator may be on this node, too.
     chosen = ("--pod-selector", names.LABEL_POOL, "--delete-emptydir-data", "--timeout=50s")
-    try:
+    with cordoned(scene.kube, node):
         scene.kube.kubectl("drain", node, *chosen)
         scene.wait("they are gone", lambda: not pods & scene.now["pods"].keys())
         yield pods
-    finally:
-        scene.kube.kubectl("uncordon", node)
 
 
 def test_tasks_that_end_in_time_run_once(programs: Programs, scene: Scene) -> None:
@@ -75,17 +74,23 @@ def test_a_budget_keeps_a_warm_pool_ready(pool: Pool, agent: Body, cluster: Clus
     """Of two workers on a node, the second goes once there is another on the other node."""
     scene = pool.scene
     *others, node = cluster.workers()
-    scene.kube.kubectl("cordon", *others)
-    try:
+    with cordoned(scene.kube, *others):
         before = pool.apply(agent, minReplicas=2, minAvailable=1).ready(2)
-    finally:
-        scene.kube.kubectl("uncordon", *others)
     with drained(scene, node) as pods:
         assert sorted(pods) == before
         pool.ready(2)
     came = scene.first("pods", lambda pod: name_of(pod) not in pods and is_ready(pod))
     went = sorted(scene.first("pods", partial(is_ending, name=name)) for name in pods)
     assert went[0] < came <= went[1]
+
+
+def test_a_killed_test_leaves_no_node_cordoned(cluster: Cluster, kube: Kube) -> None:
+    nodes = cluster.workers()
+    killed = cordoned(kube, nodes[0])
+    killed.__enter__()
+    assert nodes[0] not in cluster.workers()
+    uncordon(kube)  # as the next session begins
+    assert cluster.workers() == nodes
 
 
 def is_ending(pod: Body, *, name: str) -> bool:
