@@ -437,7 +437,7 @@ class Pool:
         if self._state != RUN:
             raise ValueError("Pool not running")
         if func is not None:
-            self._executor.suit(func)
+            self._executor.choose_resources(func)
 
     def _check_owner(self) -> None:
         if os.getpid() != self._owner:

@@ -275,9 +275,8 @@ class PoolAudit:
             executor._sender._unsent,
             executor._jobs._streams,
             *(queue.called for queue in executor.calls._queues),
-            executor._exits,
-            executor._receiver._last_words,
-            executor._leases._lent,
+            executor._leases._workers,
+            executor._leases._leases,
         )
         require(not any(left), "the pool leaves something behind")
 

@@ -232,7 +232,7 @@ def leases_what_is_needed(patch: Patch) -> None:
 
 
 def forgets_calls_that_take_longer(patch: Patch) -> None:
-    def _adopt(self: Leases, lease: Lease, seq: int, call: Call) -> None:
+    def _adopt(self: Leases, lease: Lease, call: Call) -> None:
         self._return_idle(lease)
 
     patch.setattr(Leases, "_adopt", _adopt)

@@ -90,8 +90,7 @@ def test_a_loop_that_is_about_to_look_for_calls_is_not_told_of_each(
     monkeypatch.setattr(rig.loop, "call_soon", tell)
     many = [rig.call() for _ in range(100)]
     assert len(told) < 10
-    blocking = Call("now", b"", (), None, Results())
-    blocking.blocking = True
+    blocking = Call("now", b"", (), None, Results(), blocking=True)
     before = len(told)
     rig.executor.calls.put(blocking)
     assert len(told) == before + 1

@@ -112,6 +112,10 @@ class PoolWorkerSet:
             if not self.failures:
                 self._failures.pause = 0.0
 
+    def give_up(self, error: FiberError) -> None:
+        """Take note that no more workers can start, because of ``error``."""
+        self.error = error
+
     def let_go(self, member: PoolMember) -> None:
         """Count a worker as leaving; the caller asks it to end, or kills it."""
         self._uncount(member)

@@ -35,7 +35,7 @@ from fiber._runtime.answers import TaskFailure, decode
 from fiber._runtime.background import BackgroundThread, UserThreads, say
 from fiber._runtime.jobs import TICK, CallQueue, Calls, Jobs
 from fiber._runtime.latch import Latch
-from fiber._runtime.leases import ADOPTED, UNAVAILABLE, Leases
+from fiber._runtime.leases import ADOPTED, UNAVAILABLE, LeasedWorker, Leases
 from fiber._runtime.options import PoolOptions
 from fiber._runtime.receiver import AnswerReceiver
 from fiber._runtime.sender import BatchSender
@@ -101,7 +101,7 @@ class PoolExecutor:
         self._launcher = Launcher(
             options,
             self._resources,
-            self._loop,
+            runtime,
             self._background,
             on_failed=self._never_started,
         )
@@ -118,11 +118,7 @@ class PoolExecutor:
             advance=self._advance,
             on_ready=self._ready,
         )
-        self._lends = options.max_tasks is None and not options.retryable
-        self._exits: dict[WorkerHandle, ExitReport] = {}
-        """Ends of workers that callers are using."""
-        self._draining: set[WorkerHandle] = set()
-        """Workers that callers are using and whose hosts are about to go."""
+        self._leases_workers = options.max_tasks is None and not options.retryable
         self._functions = FunctionCache()
         self.calls = Calls(
             self._loop,
@@ -155,7 +151,7 @@ class PoolExecutor:
         if self._elastic:
             self._runtime.look_at_program()
             return  # the first task says what they need, and starts them
-        handles = [WorkerHandle(self, self._runtime) for _ in range(self.options.minimum)]
+        handles = self._launcher.make(self, self.options.minimum)
         try:
             self._loop.call_soon(self._begin, handles)
             self._runtime.look_at_program()
@@ -169,8 +165,11 @@ class PoolExecutor:
         """Start the first workers if the first task would."""
         self._loop.call_soon(self._advance)
 
-    def suit(self, function: Callable[..., Any]) -> None:
-        """Have workers that ``function`` can run on, where that can be chosen."""
+    def choose_resources(self, function: Callable[..., Any]) -> None:
+        """Let the first task choose the resources of the workers, if hosts are made for them.
+
+        ValueError if workers with other resources were chosen before.
+        """
         if self._elastic:
             self._resources.choose_for(function)
 
@@ -200,14 +199,12 @@ class PoolExecutor:
         timeout: float | None = None,
     ) -> Any:
         """The result of one call, which this thread waits for, or its exception."""
-        call = pickle_call(future, function, args, kwargs, self.reject)
+        direct = timeout is None and self._leases_workers
+        call = pickle_call(future, function, args, kwargs, self.reject, blocking=direct)
         if call is None:
             return future.get()
         self._check()
-        outcome = UNAVAILABLE
-        if timeout is None and self._lends:
-            call.blocking = True
-            outcome = self._leases.run(call)
+        outcome = self._leases.run(call) if direct else UNAVAILABLE
         if outcome is UNAVAILABLE:
             self._enqueue(call, timeout)
         elif outcome is not ADOPTED:
@@ -448,34 +445,31 @@ class PoolExecutor:
         """A worker will never see these batches."""
         self._receiver.recalled(handle, seqs)
 
-    def _adopt(self, handle: WorkerHandle, seq: int, call: Call) -> None:
-        """A caller sent this worker a call, and leaves the answer to us."""
+    def _adopt(self, leased: LeasedWorker, call: Call) -> None:
+        """Take over a call that its caller sent to a worker: its answer comes through the loop."""
+        handle = leased.handle
         item = WorkItem(work.CALLS, exact=True)
         job = self._jobs.open(item)
         assert handle.worker is not None
-        self._scheduler.return_busy(handle.worker, seq, job, call, self._loop.now())
+        self._scheduler.return_busy(handle.worker, leased.seq, job, call, self._loop.now())
         self._jobs.close(item)
         if self._ended_by is not None:
             self._jobs.fail(job, self._ended_by)
-        self._receiver.replay(handle)
+        self._receiver.replay(leased)
 
-    def _back(self, handle: WorkerHandle) -> None:
-        """A worker is not lent any more."""
-        self._receiver.forget(handle)
-        report = self._exits.pop(handle, None)
-        drained = handle in self._draining
-        self._draining.discard(handle)
-        if report is not None:
-            self.on_exit(handle, report)
-        elif drained:
-            self.on_draining(handle)
+    def _back(self, leased: LeasedWorker) -> None:
+        """Go on with a worker that was leased."""
+        if leased.report is not None:
+            self.on_exit(leased.handle, leased.report)
+        elif leased.draining:
+            self.on_draining(leased.handle)
         else:
             self._advance()
 
     # Workers come and go
 
     def _start_workers(self, count: int) -> None:
-        handles = [WorkerHandle(self, self._runtime) for _ in range(count)]
+        handles = self._launcher.make(self, count)
         self._begin(handles)
         self._launcher.launch_soon(handles)
 
@@ -501,10 +495,7 @@ class PoolExecutor:
 
     def on_draining(self, handle: WorkerHandle) -> None:
         """A worker's host is about to go: another takes its place, and what it has not begun."""
-        leased = handle.worker is not None and handle.worker.leased
-        if leased and not self._leases.recall_one(handle):
-            self._draining.add(handle)  # until the caller that uses it brings it back
-        elif self._scheduler.drain(handle):
+        if not self._leases.keep_draining(handle) and self._scheduler.drain(handle):
             _logs.debug("worker %s is drained", handle.name)
             if handle.child is not None:
                 handle.child.recall()
@@ -514,10 +505,8 @@ class PoolExecutor:
 
     def on_exit(self, handle: WorkerHandle, report: ExitReport) -> None:
         """A worker is gone, with or without having been told to."""
-        leased = handle.worker is not None and handle.worker.leased
-        if leased and not self._leases.recall_one(handle):
-            self._exits[handle] = report  # whoever uses it notices, and brings it back
-            return
+        if self._leases.keep_exit(handle, report):
+            return  # until the caller that uses it puts the lease back
         self._sender.exited(handle, report.stack)
         # A lost host says nothing of the worker.
         lost_host = report.disrupted or report.cause == Cause.AGENT_LOST
@@ -569,7 +558,7 @@ class PoolExecutor:
     def broken(self, error: FiberError) -> None:
         """The loop has failed: nobody will hear of the workers any more."""
         handles: list[Any] = list(self._scheduler.workers.members)
-        self._scheduler.workers.error = error
+        self._scheduler.workers.give_up(error)
         self._terminate(error)
         for handle in handles:
             handle.kill()

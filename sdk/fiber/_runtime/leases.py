@@ -1,19 +1,19 @@
-"""Calls that a waiting thread gives to a worker itself, without the loop in between.
+"""Calls that a waiting thread sends to a worker itself, past the loop.
 
-An ``apply`` that went through the loop would wake two threads that only pass it on.  So the
-scheduler lends an idle worker: whoever calls next takes it, sends it the call, waits for the answer
-and leaves it for the next one.  Ray's callers lease workers in the same way.  What goes to another
-host still passes the loop, whose link it is, but no scheduler.  ::
+An ``apply`` through the loop would wake two threads that only pass it on.  So an idle worker is
+leased: the next caller takes the lease, sends the worker its call, waits for the answer and puts
+the lease back.  Ray's callers lease workers in the same way.  A call for another host still passes
+the loop, which has its link, but no scheduler.  ::
 
-    loop's thread                  any thread                         worker
+    loop thread                    any thread                         worker
     offer ──► idle leases ──pop──► run ─────────── send, receive ───► │
                   ▲                 ├── answered: append ──┘
     recall ◄──────┘                 ├── takes longer, or its worker is gone: adopt
                                     └── interrupted: abandon
 
-A lease belongs to whoever popped it; nothing else is shared, so an interruption at any line leaves
-at most a lease that nobody returns.  Of that a weak reference tells, in one step of the
-interpreter's own, and the loop takes the worker back.
+A lease belongs to the thread that popped it, and threads share nothing else.  So an interruption at
+any line leaves at most a lease that no thread returns.  Its weak reference reports that in one
+atomic step, and the loop takes the worker back.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from fiber._agent.interface import DirectChannel
+from fiber._agent.interface import DirectChannel, ExitReport
 from fiber._engine.scheduler import Scheduler
 from fiber._engine.tasks import WrongAnswer
-from fiber._runtime.answers import OTHER, read, single
+from fiber._runtime.answers import OTHER, Words, read, single
 from fiber._runtime.work_items import Call
 from fiber._runtime.workers import WorkerHandle
 from fiber._transport.loop import Loop, Timer
@@ -38,10 +38,10 @@ ATTENTION = 5e-3
 """Seconds that a caller waits for a worker itself before it leaves the answer to the loop."""
 
 UNUSED = 0.05
-"""Seconds without a call after which a lease ends: its worker may leave, or be given other work."""
+"""Seconds without a call after which a lease ends: its worker may leave, or get other tasks."""
 
 NO_OP_MESSAGE = work.pack_calls([(pickle.dumps((bool, (), {})), ())])
-"""A call whose answer says that all before it is answered."""
+"""Call that does nothing.  Its answer says that all calls before it are answered."""
 
 
 class NoOutcome:
@@ -49,31 +49,50 @@ class NoOutcome:
 
 
 UNAVAILABLE = NoOutcome()
-"""No worker was to be had."""
+"""No worker was available."""
 
 ADOPTED = NoOutcome()
-"""The loop has taken over, and will tell the call's future."""
+"""The loop has taken over, and sets the outcome of the call's future."""
+
+
+class LeasedWorker:
+    """What happened to a leased worker while a caller used it.  Only ``Leases`` changes it."""
+
+    __slots__ = ("answer", "draining", "handle", "report", "seq", "unread")
+
+    def __init__(self, handle: WorkerHandle) -> None:
+        self.handle = handle
+        self.seq = 0
+        """Number of the last call that a caller sent it."""
+        self.answer: Words | None = None
+        """Last packet of a worker that died, received by the agent and not by the caller."""
+        self.unread: list[int] = []
+        """Calls that the worker gave back, before they are batches of the ledger."""
+        self.report: ExitReport | None = None
+        """End of the worker."""
+        self.draining = False
+        """True if the worker's host is about to end."""
 
 
 class Lease:
-    """An idle worker for direct use."""
+    """Right of one thread at a time to send a worker calls."""
 
-    __slots__ = ("__weakref__", "channel", "handle", "surprise", "used")
+    __slots__ = ("__weakref__", "channel", "surprise", "used", "worker")
 
-    def __init__(self, handle: WorkerHandle, channel: DirectChannel) -> None:
-        self.handle = handle
+    def __init__(self, worker: LeasedWorker, channel: DirectChannel) -> None:
+        self.worker = worker
         self.channel = channel
         self.used = True
-        """Since somebody looked last."""
+        """True if a caller used it since the last look."""
         self.surprise: Message | None = None
         """Message of its worker that is not the answer; the loop judges it."""
 
 
 class Leases:
-    """The workers of one pool that are lent.
+    """Leases of one pool's workers, and what happens to leased workers.
 
-    ``on_adopted`` is called, on the loop's thread, with a call that its caller leaves to the loop,
-    ``on_back`` with each worker that is back.
+    ``on_adopted`` is called with a call that its caller leaves to the loop, ``on_back`` with each
+    worker that is back.  Both run on the loop thread.
     """
 
     def __init__(
@@ -81,8 +100,8 @@ class Leases:
         scheduler: Scheduler,
         loop: Loop,
         *,
-        on_adopted: Callable[[WorkerHandle, int, Call], None],
-        on_back: Callable[[WorkerHandle], None],
+        on_adopted: Callable[[LeasedWorker, Call], None],
+        on_back: Callable[[LeasedWorker], None],
     ) -> None:
         self._scheduler = scheduler
         self._batches = scheduler.ledger.batches
@@ -91,24 +110,24 @@ class Leases:
         self._on_back = on_back
         self._check: Timer | None = None
         self._idle: deque[Lease] = deque()
-        self._lent: dict[weakref.ref[Lease], WorkerHandle] = {}
+        self._leases: dict[weakref.ref[Lease], LeasedWorker] = {}
+        self._workers: dict[WorkerHandle, LeasedWorker] = {}
         self._dropped: deque[weakref.ref[Lease]] = deque()
         self._recalled = False
 
     # Any thread
 
     def run(self, call: Call) -> Any:
-        """The outcome of a call; UNAVAILABLE if it was not sent, ADOPTED if that takes longer."""
+        """Return the outcome of a call; UNAVAILABLE if unsent, ADOPTED if the loop takes over."""
         try:
             lease = self._idle.pop()
         except IndexError:
             return UNAVAILABLE
         lease.used = True
         try:
-            seq = self._scheduler.ledger.next_seq()
-            answer = self._exchange(lease, seq, call)
+            answer = self._exchange(lease, call)
             if answer is ADOPTED:
-                self._loop.call_soon(self._adopt, lease, seq, call)
+                self._loop.call_soon(self._adopt, lease, call)
                 return ADOPTED
         except BaseException:
             self._loop.call_soon(self._abandon, lease)
@@ -116,19 +135,19 @@ class Leases:
         self._put_back(lease)
         return answer
 
-    def _exchange(self, lease: Lease, seq: int, call: Call) -> Any:
-        handle, channel = lease.handle, lease.channel
-        handle.asked = seq
+    def _exchange(self, lease: Lease, call: Call) -> Any:
+        channel = lease.channel
+        lease.worker.seq = seq = self._scheduler.ledger.next_seq()
         try:
             channel.send(seq, call.message(), call.buffers)
-        except OSError:  # whoever sends it in our place will see why
+        except OSError:  # the loop sends it instead, and reports what is wrong
             return UNAVAILABLE
         while True:
             try:
                 message = channel.receive(ATTENTION)
-            except BrokenPipeError:  # it was gone before that was sent
+            except BrokenPipeError:  # the worker was gone before the call was sent
                 return UNAVAILABLE
-            except (EOFError, OSError, MemoryError):  # it is gone, as the loop is about to hear
+            except (EOFError, OSError, MemoryError):  # it is gone, as its agent will report
                 return ADOPTED
             if message is None:
                 return ADOPTED
@@ -138,7 +157,7 @@ class Leases:
                 return ADOPTED
             message.release()
             if result is not OTHER:
-                handle.tasks += 1
+                lease.worker.handle.did(1)
                 return result
 
     def _is_late(self, message: Message, seq: int) -> bool:
@@ -151,14 +170,14 @@ class Leases:
 
     def _put_back(self, lease: Lease) -> None:
         self._idle.append(lease)
-        # The loop notes that it wants them back and takes what is there then.
+        # The loop sets the mark first and takes the idle leases then.
         if self._recalled:
             self._loop.call_soon(self.recall)
 
-    # The loop's thread
+    # The loop thread
 
     def offer(self, handle: WorkerHandle) -> None:
-        """Lend a worker that has become idle, if nobody else needs it."""
+        """Lease a worker that has become idle, unless waiting tasks need it."""
         if handle.worker is None or handle.child is None:
             return
         if not self._scheduler.lease(handle.worker):
@@ -167,31 +186,32 @@ class Leases:
         if channel is None:
             self._scheduler.return_idle(handle.worker, self._loop.now())
             return
-        lease = Lease(handle, channel)
-        self._lent[weakref.ref(lease, self._dropped.append)] = handle
+        self._workers[handle] = worker = LeasedWorker(handle)
+        lease = Lease(worker, channel)
+        self._leases[weakref.ref(lease, self._dropped.append)] = worker
         self._recalled = False
         self._idle.append(lease)
         if self._check is None:
             self._check = self._loop.call_later(UNUSED, self._recall_unused)
 
     def recall(self) -> None:
-        """Take back those that nobody uses, and the others as soon as they are left."""
+        """End the idle leases, and the others as soon as their callers put them back."""
         self._recalled = True
         while self._idle:
             try:
                 lease = self._idle.pop()
-            except IndexError:  # somebody was faster, and will bring it back
+            except IndexError:  # a caller was faster, and will put it back
                 break
             self._return_idle(lease)
         self._find_dropped()
 
-    def recall_one(self, handle: WorkerHandle) -> bool:
-        """Take this one back; False if somebody uses it, and will bring it back."""
+    def _recall_one(self, handle: WorkerHandle) -> bool:
+        """End the lease of this worker; False if a caller uses it, and will put it back."""
         for lease in list(self._idle):
-            if lease.handle is handle:
+            if lease.worker.handle is handle:
                 try:
                     self._idle.remove(lease)
-                except ValueError:  # somebody was faster
+                except ValueError:  # a caller was faster
                     return False
                 self._return_idle(lease)
                 return True
@@ -202,58 +222,103 @@ class Leases:
         if self._check is not None:
             self._check.cancel()
 
+    # What happens to a worker while a caller uses it counts once the worker is back
+
+    def keep_answer(self, handle: WorkerHandle, words: Words) -> bool:
+        """Keep an answer until the worker is back; False if no caller leases the worker."""
+        worker = self._leased(handle)
+        if worker is not None:
+            worker.answer = words
+        return worker is not None
+
+    def keep_unread(self, handle: WorkerHandle, seqs: list[int]) -> None:
+        """Keep calls that a leased worker gave back: a recall from before the lease took them."""
+        worker = self._leased(handle)
+        if worker is not None:
+            worker.unread.extend(seqs)
+
+    def keep_exit(self, handle: WorkerHandle, report: ExitReport) -> bool:
+        """Keep the end of a worker until its caller notices; False if no caller uses it."""
+        worker = self._leased(handle)
+        if worker is None or self._recall_one(handle):
+            return False
+        worker.report = report
+        return True
+
+    def keep_draining(self, handle: WorkerHandle) -> bool:
+        """Note that the worker's host is about to end; False if no caller uses the worker."""
+        worker = self._leased(handle)
+        if worker is None or self._recall_one(handle):
+            return False
+        worker.draining = True
+        return True
+
+    def _leased(self, handle: WorkerHandle) -> LeasedWorker | None:
+        leased = handle.worker is not None and handle.worker.leased
+        return self._workers.get(handle) if leased else None
+
+    # Ends of leases
+
     def _recall_unused(self) -> None:
-        """Take back those that nobody used since this was called last."""
+        """End the leases that no caller used since this was called last."""
         self._check = None
         for lease in list(self._idle):
             if not lease.used:
-                self.recall_one(lease.handle)
+                self._recall_one(lease.worker.handle)
             lease.used = False
         self._find_dropped()
-        if self._lent:
+        if self._leases:
             self._check = self._loop.call_later(UNUSED, self._recall_unused)
 
     def _return_idle(self, lease: Lease) -> None:
-        handle = self._end(lease)
+        self._end(lease)
+        handle = lease.worker.handle
         if handle.worker is not None:
             self._scheduler.return_idle(handle.worker, self._loop.now())
-        self._on_back(handle)
+        self._back(lease.worker)
 
-    def _adopt(self, lease: Lease, seq: int, call: Call) -> None:
-        # First what the answer is to: it may be there already.
-        self._on_adopted(lease.handle, seq, call)
-        handle = self._end(lease)
+    def _adopt(self, lease: Lease, call: Call) -> None:
+        worker = lease.worker
+        # First the task that the answer belongs to: the answer may be there already.
+        self._on_adopted(worker, call)
+        self._end(lease)
         if lease.surprise is not None:
-            handle.received(lease.surprise)
-        self._on_back(handle)
+            worker.handle.received(lease.surprise)
+        self._back(worker)
 
     def _abandon(self, lease: Lease) -> None:
-        if weakref.ref(lease) in self._lent:  # else it was adopted
-            self._return_abandoned(self._end(lease))
+        if weakref.ref(lease) in self._leases:  # else it was adopted
+            self._end(lease)
+            self._return_abandoned(lease.worker)
 
     def _find_dropped(self) -> None:
         while self._dropped:
-            handle = self._lent.pop(self._dropped.popleft(), None)
-            if handle is not None:
-                self._take_over(handle)
-                self._return_abandoned(handle)
+            worker = self._leases.pop(self._dropped.popleft(), None)
+            if worker is not None:
+                self._take_over(worker.handle)
+                self._return_abandoned(worker)
 
-    def _return_abandoned(self, handle: WorkerHandle) -> None:
+    def _return_abandoned(self, worker: LeasedWorker) -> None:
         """Return a worker that may still run a call whose caller has gone."""
+        handle = worker.handle
         assert handle.worker is not None
         assert handle.child is not None
-        self._scheduler.ledger.expect_late(handle.worker, handle.asked)
+        self._scheduler.ledger.expect_late(handle.worker, worker.seq)
         seq = self._scheduler.ledger.next_seq()
         self._scheduler.return_busy(handle.worker, seq, None, None, self._loop.now())
         handle.child.deliver(seq, NO_OP_MESSAGE)
-        self._on_back(handle)
+        self._back(worker)
 
-    def _end(self, lease: Lease) -> WorkerHandle:
-        self._lent.pop(weakref.ref(lease), None)
+    def _end(self, lease: Lease) -> None:
+        self._leases.pop(weakref.ref(lease), None)
         lease.channel.close()
-        self._take_over(lease.handle)
-        return lease.handle
+        self._take_over(lease.worker.handle)
 
     def _take_over(self, handle: WorkerHandle) -> None:
         if handle.child is not None:
             handle.child.reclaim()
+
+    def _back(self, worker: LeasedWorker) -> None:
+        if self._workers.get(worker.handle) is worker:
+            del self._workers[worker.handle]
+        self._on_back(worker)

@@ -13,7 +13,7 @@ from fiber._engine.tasks import Batch, WrongAnswer
 from fiber._runtime.answers import Pickled, Words, read
 from fiber._runtime.background import BackgroundThread, say
 from fiber._runtime.jobs import Jobs
-from fiber._runtime.leases import Leases
+from fiber._runtime.leases import LeasedWorker, Leases
 from fiber._runtime.sender import BatchSender
 from fiber._runtime.work_items import WorkItem
 from fiber._runtime.workers import WorkerHandle
@@ -49,10 +49,6 @@ class AnswerReceiver:
         self._leases = leases
         self._advance = advance
         self._on_ready = on_ready
-        self._last_words: dict[WorkerHandle, Words] = {}
-        """Last packets of leased workers that died, received by the agent and not by the caller."""
-        self._taken_back: dict[WorkerHandle, list[int]] = {}
-        """From workers that callers use: calls of theirs, which are no batches yet."""
 
     def take(self, handle: WorkerHandle, message: Message) -> None:
         """A packet from a worker."""
@@ -66,14 +62,12 @@ class AnswerReceiver:
 
     def _take(self, handle: WorkerHandle, words: Words) -> None:
         if type(words[0]) is int:
-            if handle.worker is not None and handle.worker.leased:
-                self._last_words[handle] = words
-            else:
+            if not self._leases.keep_answer(handle, words):
                 self._answered(handle, words)
         elif words[0] == work.READY:
             self._on_ready(handle)
         elif words[0] == work.INIT_FAILED:
-            handle.complaint = words[1]
+            handle.complain(words[1])
         elif words[0] == work.UNKNOWN:
             batch = self._held(handle, words[1])
             if batch is not None and batch.has_function:
@@ -93,28 +87,22 @@ class AnswerReceiver:
 
     def _convict(self, handle: WorkerHandle, reason: str) -> None:
         """Kill a worker that sent what it cannot send; its tasks run elsewhere once it is gone."""
-        handle.fault = reason
         if handle.worker is not None:
             self._ledger.retire(handle.worker)
-        handle.kill()
+        handle.convict(reason)
         with contextlib.suppress(RuntimeError):  # the system has no room for its thread
             self._background.submit(say, f"pool worker {handle.name!r} is killed: {reason}")
         self._advance()
 
-    def replay(self, handle: WorkerHandle) -> None:
-        """A worker is not lent any more: what was heard of it meanwhile counts now."""
-        if handle in self._last_words:
+    def replay(self, worker: LeasedWorker) -> None:
+        """Take what a leased worker sent: the call of its caller is a task of the ledger now."""
+        if worker.answer is not None:
             try:
-                self._answered(handle, self._last_words.pop(handle))
+                self._answered(worker.handle, worker.answer)
             except WrongAnswer as error:
-                self._convict(handle, str(error))
-        if handle in self._taken_back:
-            self.recalled(handle, self._taken_back.pop(handle))
-
-    def forget(self, handle: WorkerHandle) -> None:
-        """Forget the last packets of a worker."""
-        self._last_words.pop(handle, None)
-        self._taken_back.pop(handle, None)
+                self._convict(worker.handle, str(error))
+        if worker.unread:
+            self.recalled(worker.handle, worker.unread)
 
     def _answered(self, handle: WorkerHandle, results: Words) -> None:
         seq, offset, kept, seconds, values, mixed, size = results
@@ -123,7 +111,7 @@ class AnswerReceiver:
         receipt = self._ledger.receive(
             handle.worker, seq, offset, len(values), self._loop.now(), seconds=seconds, kept=kept
         )
-        handle.tasks += len(values)
+        handle.did(len(values))
         self._scheduler.workers.did_something()
         self._sender.settled(seq)
         if receipt is not None:
@@ -170,7 +158,6 @@ class AnswerReceiver:
             return
         if 0 in seqs:  # no batch, but what told it to end: the recall was later by an agent's turn
             handle.dismiss()
-        if seqs and handle.worker.leased:  # a recall that was on its way as it was lent took them
-            self._taken_back.setdefault(handle, []).extend(seqs)
+        self._leases.keep_unread(handle, seqs)
         self._sender.unread(handle.worker, seqs)
         self._advance()

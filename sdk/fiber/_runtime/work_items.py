@@ -264,14 +264,15 @@ class Call:
         buffers: Sequence[memoryview],
         grants: GrantSet | None,
         future: Future,
+        blocking: bool = False,
     ) -> None:
         self.grants = grants
         self.name = name
         self.data = data
         self.buffers = buffers
         self.future = future
-        self.blocking = False
-        """True if a thread only waits for the outcome."""
+        self.blocking = blocking
+        """True if a thread waits for the outcome at once."""
 
     def copy_buffers(self) -> None:
         """Keep what was passed as it is now: the caller goes on before it is sent."""
@@ -347,6 +348,8 @@ def pickle_call(
     args: Iterable[Any],
     kwargs: Mapping[str, Any],
     reject: Callable[[Future, BaseException], None],
+    *,
+    blocking: bool = False,
 ) -> Call | None:
     """A call, pickled; None if it does not pickle, and ``reject`` has told its future."""
     try:
@@ -356,7 +359,7 @@ def pickle_call(
     except Exception as error:
         reject(future, _blame_call(function, args, kwargs, error))
         return None
-    return Call(name_of(function), *work.beside((data, buffers)), grants, future)
+    return Call(name_of(function), *work.beside((data, buffers)), grants, future, blocking)
 
 
 def _blame_call(

@@ -20,7 +20,7 @@ from fiber._exceptions import fresh
 from fiber._runtime.background import BackgroundThread
 from fiber._runtime.latch import Latch
 from fiber._runtime.options import PoolOptions
-from fiber._runtime.state import SharedArguments
+from fiber._runtime.state import Runtime, SharedArguments
 from fiber._transport.loop import Loop, Timer, Wakeup
 from fiber._wire import work
 from fiber._wire.packet import Message
@@ -74,15 +74,16 @@ class Supervisor(Protocol):
 class WorkerHandle:
     """Process of a worker on the side of its pool; also the ``Popen`` behind its Process object.
 
-    The scheduler knows it as a ``Member`` of the pool's worker set.
+    The scheduler knows it as a ``PoolMember``.  The pool's worker set changes ``worker`` and
+    ``leaving``; all else changes here alone.
     """
 
     sentinel = -1
     """Placeholder that a Process reads when it starts.  A real sentinel is made if it is wanted."""
 
-    def __init__(self, supervisor: Supervisor, host: Any) -> None:
+    def __init__(self, supervisor: Supervisor, runtime: Runtime, shared: SharedArguments) -> None:
         self.process: BaseProcess | None = None
-        """Once it is started."""
+        """Process object of the worker, once it is started."""
         self.child: ChildHandle | None = None
         self.worker: WorkerEntry | None = None
         """Entry of the worker in the ledger, once it is ready."""
@@ -90,19 +91,15 @@ class WorkerHandle:
         """Error of its initializer, or of its start."""
         self.fault = ""
         """Wrong answer for which the pool has killed it."""
-        self.asked = 0
-        """Number of the last call that a caller sent it directly."""
         self.leaving = False
         """True if it was told to leave, or will be at once."""
-        self.unwanted = False
-        """True if it was told to end at once, also in the middle of a task."""
         self.tasks = 0
         """Number of tasks that it has done."""
         self.returncode: int | None = None
-        self.shared: SharedArguments | None = None
-        """Arguments that all workers of its pool are started with."""
         self._supervisor = supervisor
-        self._host = host
+        self._runtime = runtime
+        self._shared = shared  # arguments that all workers of its pool are started with
+        self._terminated = False
         self._pid: int | None = None
         self._born = Latch()
         self._exited = Latch()
@@ -119,11 +116,29 @@ class WorkerHandle:
         """The name of its host, once that is known."""
         return self.child.host if self.child is not None else "?"
 
+    def start(self, process: BaseProcess) -> None:
+        """Start the worker as ``process``, a Process object that was made for this handle."""
+        process.start()
+        self.process = process
+
     def launch(self, process: BaseProcess, method: str) -> None:
-        """Start the process; returns before it exists."""
+        """Start the process, on behalf of its Process object; returns before it exists."""
         _logs.debug("starting worker %s", process.name)
         self._launched = process
-        self._host.start(process, self, tasks=True, method=method, shared=self.shared)
+        self._runtime.start(process, self, tasks=True, method=method, shared=self._shared)
+
+    def did(self, tasks: int) -> None:
+        """Count tasks that the worker has done."""
+        self.tasks += tasks
+
+    def complain(self, error: str) -> None:
+        """Note the error of the worker's initializer, or of its start."""
+        self.complaint = error
+
+    def convict(self, reason: str) -> None:
+        """Kill the worker, since it sent what no worker sends."""
+        self.fault = reason
+        self.kill()
 
     # What the agent says, on the loop's thread
 
@@ -133,7 +148,7 @@ class WorkerHandle:
         child.start()
         if self.leaving:  # it was told to before it could be reached
             self.dismiss()
-            if self.unwanted:
+            if self._terminated:
                 self.kill()
 
     def started(self, pid: int) -> None:
@@ -188,8 +203,8 @@ class WorkerHandle:
     @property
     def pid(self) -> int | None:
         """Pid of the process.  Waits until there is one."""
-        if self._pid is None and not self._host.loop.on_thread():
-            self._born.wait(self._host.config.start_timeout)
+        if self._pid is None and not self._runtime.loop.on_thread():
+            self._born.wait(self._runtime.config.start_timeout)
         return self._pid
 
     def exit_descriptor(self) -> int:
@@ -223,7 +238,7 @@ class WorkerHandle:
 
     def terminate(self) -> None:
         """SIGTERM."""
-        self.unwanted = True
+        self._terminated = True
         self.signal(signal.SIGTERM)
 
     def kill(self) -> None:
@@ -255,7 +270,7 @@ class Launcher:
         self,
         options: PoolOptions,
         resources: WorkerResources,
-        loop: Loop,
+        runtime: Runtime,
         background: BackgroundThread,
         *,
         on_failed: Callable[[Sequence[WorkerHandle], BaseException | None], None],
@@ -265,11 +280,16 @@ class Launcher:
             (options.initializer, options.initargs, options.retryable)
         )
         self._resources = resources
-        self._loop = loop
+        self._runtime = runtime
+        self._loop = runtime.loop
         self._background = background
         self._on_failed = on_failed
         self._ending: list[WorkerHandle] = []
         self._kill: Timer | None = None
+
+    def make(self, supervisor: Supervisor, count: int) -> list[WorkerHandle]:
+        """Return handles of workers to be started."""
+        return [WorkerHandle(supervisor, self._runtime, self._arguments) for _ in range(count)]
 
     def launch_now(self, handles: Sequence[WorkerHandle], timeout: float) -> None:
         """Start some on the calling thread; raises what stands in the way of one."""
@@ -292,14 +312,12 @@ class Launcher:
                 raise fresh(handle.child.start_error)
 
     def _start(self, handle: WorkerHandle) -> None:
-        handle.shared = self._arguments
         process = self._options.new_process(
             handle,
             target=with_resources(worker.run, self._resources.chosen),
             args=self._arguments.args,
         )
-        process.start()
-        handle.process = process
+        handle.start(process)
 
     def launch_soon(self, handles: Sequence[WorkerHandle]) -> None:
         """Start some on the background thread; called on the loop's."""
