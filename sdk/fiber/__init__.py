@@ -189,7 +189,7 @@ _SUBMODULES = frozenset(
     }
 )
 
-_OTHER_FILES = frozenset({"agent", "inherited", "joblib"})
+_OTHER_FILES = frozenset({"agent", "joblib"})
 
 _HOMES = {
     "AdoptionError": "errors",

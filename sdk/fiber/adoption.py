@@ -58,7 +58,7 @@ class Adoption:
         and class attributes where they are: `start.context`, `Worker.make_queue`.
         """
         with _lock:
-            state = _states.get(self.module)
+            state = _adopted.get(self.module)
             return tuple(sorted({place.name for place in state.bindings})) if state else ()
 
     def __enter__(self) -> ModuleType:
@@ -80,13 +80,13 @@ class Adoption:
         with _lock:
             if self._held:
                 return
-            state = _states.get(self.module) or _State()
+            state = _adopted.get(self.module) or _AdoptedModule()
             # Again even if adopted already: a reload of the module undoes it.
             bindings = _plan(self.module, self._fiber, adopted=bool(state.holders))
             _rebind(self.module, bindings)
             state.bindings.update(bindings)
             state.holders += 1
-            _states[self.module] = state
+            _adopted[self.module] = state
             self._held = True
 
     def _release(self) -> None:
@@ -94,18 +94,18 @@ class Adoption:
             if not self._held:
                 return
             self._held = False
-            state = _states[self.module]
+            state = _adopted[self.module]
             state.holders -= 1
             if state.holders:
                 return
-            del _states[self.module]
+            del _adopted[self.module]
             for place, binding in state.bindings.items():
                 # What somebody else has bound since is theirs.
                 if place.read(self.module) is binding.new:
                     place.write(self.module, binding.old)
 
 
-class _Place(Protocol):
+class _Reference(Protocol):
     """Something of a module that refers to an object; it does not refer to the module."""
 
     @property
@@ -184,15 +184,15 @@ class _Binding(NamedTuple):
 
 
 @dataclass
-class _State:
+class _AdoptedModule:
     """Bindings in effect in one module, and the number of Adoptions that hold them."""
 
-    bindings: dict[_Place, _Binding] = field(default_factory=dict)
+    bindings: dict[_Reference, _Binding] = field(default_factory=dict)
     holders: int = 0
 
 
 _lock = threading.RLock()  # importing Fiber's submodules may run code that adopts
-_states: weakref.WeakKeyDictionary[ModuleType, _State] = weakref.WeakKeyDictionary()
+_adopted: weakref.WeakKeyDictionary[ModuleType, _AdoptedModule] = weakref.WeakKeyDictionary()
 
 
 def _resolve(module: str | ModuleType) -> ModuleType:
@@ -217,7 +217,7 @@ def _resolve(module: str | ModuleType) -> ModuleType:
 # ---- deciding -------------------------------------------------------------------------------
 
 
-def _plan(module: ModuleType, fiber: Any, *, adopted: bool) -> dict[_Place, _Binding]:
+def _plan(module: ModuleType, fiber: Any, *, adopted: bool) -> dict[_Reference, _Binding]:
     """Return what to rebind in the module; AdoptionError with everything that is in the way."""
     survey = _Survey(module, fiber)
     if survey.problems:
@@ -231,7 +231,7 @@ class _Survey:
     """Uses of multiprocessing in one module: places to rebind, and problems that prevent it."""
 
     def __init__(self, module: ModuleType, fiber: Any) -> None:
-        self.bindings: dict[_Place, _Binding] = {}
+        self.bindings: dict[_Reference, _Binding] = {}
         self.problems: list[str] = []
         self.uses_any = False
         self._fiber = fiber
@@ -241,7 +241,7 @@ class _Survey:
                 self._look_into(name, value)
 
     def _take(
-        self, place: _Place, value: object, what: str, around: type[Any] | None = None
+        self, place: _Reference, value: object, what: str, around: type[Any] | None = None
     ) -> bool:
         """Plan to rebind a place whose ``value``, inside of ``around``, was taken from
         multiprocessing; False if it was not.
@@ -300,15 +300,15 @@ class _Survey:
         if isinstance(wrapped, FunctionType) and wrapped.__module__ == self._module.__name__:
             self._look_into_function(name, wrapped)
 
-    def _take_default(self, name: str, place: _Place, value: object) -> None:
+    def _take_default(self, name: str, place: _Reference, value: object) -> None:
         what = f"the default value of {place.name!r}"
         if not self._take(place, value, what) and (left := _leftover(value, self._fiber)):
             self.problems.append(f"function {name!r} has the default value {left}")
 
 
-def _rebind(module: ModuleType, bindings: dict[_Place, _Binding]) -> None:
+def _rebind(module: ModuleType, bindings: dict[_Reference, _Binding]) -> None:
     """Rebind all places or, where one cannot be written to, none."""
-    done: list[_Place] = []
+    done: list[_Reference] = []
     try:
         for place, binding in bindings.items():
             place.write(module, binding.new)

@@ -23,7 +23,7 @@ from dataclasses import dataclass, field, fields, replace
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypedDict, Unpack, get_args
 
-from fiber import _original, _wishes, inherited
+from fiber import _config_sources, _wishes
 from fiber.errors import ConfigError
 
 __all__ = ["Config", "current", "guard", "init", "install", "load", "use"]
@@ -276,7 +276,7 @@ _KEYS = {entry.name: entry for entry in fields(Config)}
 
 if TYPE_CHECKING:
 
-    class Settings(TypedDict, total=False):
+    class ConfigKeywords(TypedDict, total=False):
         """The keys of `Config`, as `init` takes them."""
 
         backend: Backend
@@ -327,7 +327,7 @@ def current() -> Config:
     """The configuration in force: at the first call read from its sources, or a parent's."""
     config = _current.get("config")
     if config is None:
-        pickled = inherited.configuration()
+        pickled = _config_sources.configuration()
         read = pickle.loads(pickled) if pickled is not None else load()
         config = _current.setdefault("config", read)
     return config
@@ -341,7 +341,7 @@ def use() -> Config:
     return config
 
 
-def init(**settings: Unpack[Settings]) -> Config:
+def init(**settings: Unpack[ConfigKeywords]) -> Config:
     """Set keys of `Config` for this program, and return the configuration that results.
 
     Each call starts anew from the other sources: keys of an earlier call are forgotten.
@@ -415,7 +415,7 @@ def load(
     The environment and the directory to start from are the process's own unless given.
     """
     environ = os.environ if environ is None else environ
-    if message := _original.file_error(directory or os.curdir):
+    if message := _config_sources.file_error(directory or os.curdir):
         raise ConfigError(message)
     values: dict[str, Any] = {}
     sources: dict[str, str] = {}
@@ -451,7 +451,7 @@ def _checked(setting: _Setting) -> object:
 
 
 def _of_the_original(setting: _Setting) -> str | None:
-    advice = _original.replacement(setting.key, setting.spelling)
+    advice = _config_sources.replacement(setting.key, setting.spelling)
     if advice is None:
         return None
     written = setting.spelling(setting.key)
@@ -578,21 +578,21 @@ def _read_toml(path: str) -> dict[str, Any]:
 # ---- keys as attributes of this module ------------------------------------------------------
 
 
-class _Module(ModuleType):
+class _ConfigModule(ModuleType):
     """Class of this module.  Attributes with the names of keys are the configuration in force."""
 
     def __getattr__(self, name: str) -> object:
         if name in _KEYS:
             return getattr(current(), name)
-        advice = _original.replacement(name)
+        advice = _config_sources.replacement(name)
         hint = f": it is a key of the original Fiber alone. {advice}." if advice else ""
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}{hint}")
 
     def __setattr__(self, name: str, value: object) -> None:
-        if name in _KEYS or name in _original.REPLACEMENTS:
+        if name in _KEYS or name in _config_sources.REPLACEMENTS:
             assign(name, value)
         else:
             super().__setattr__(name, value)
 
 
-sys.modules[__name__].__class__ = _Module
+sys.modules[__name__].__class__ = _ConfigModule

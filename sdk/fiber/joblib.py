@@ -17,32 +17,40 @@ workers.  ``executor=`` is one of yours in its place, perhaps with options:
 from __future__ import annotations
 
 import contextlib
+import copy
 import os
+import weakref
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future
 from inspect import signature
 from typing import Any
 
 from fiber import cpu
+from fiber._hub import shared_buffer
+from fiber._hub.shared_buffer import SharedBuffer
 from fiber._installation import explained_if_missing
 from fiber._runtime.state import runtime
 from fiber.futures import Executor
 
 with explained_if_missing("fiber.joblib"):
+    import numpy as np
     from joblib import register_parallel_backend
+    from joblib._memmapping_reducer import _get_backing_memmap, _reduce_memmap_backed
     from joblib.parallel import (
         AutoBatchingMixin,
+        BatchedCalls,
         FallbackToBackend,
         ParallelBackendBase,
         SequentialBackend,
     )
 
-    from fiber._memmapping import MemmappedArguments
-
 __all__ = ["FiberBackend"]
 
 _OPTIONS = frozenset(signature(Executor).parameters) - {"max_workers"}
+
+_SHARED_ARRAYS = 64
+"""At a time: each has a descriptor."""
 
 
 class FiberBackend(AutoBatchingMixin, ParallelBackendBase):  # type: ignore[misc]
@@ -218,6 +226,97 @@ def _prepare(
         threadpool_limits(int(threads["OMP_NUM_THREADS"]))
     if initializer is not None:
         initializer(*initargs)
+
+
+class MemmappedArguments:
+    """Large arrays among the arguments of one loop, or of loops over each other's results.
+
+    Workers of this host map them, as loky's do.  An array that is sent once is pickled, which takes
+    less time than to share it.  One that is sent again, such as the data of a grid search, is
+    copied to shared memory once.  A worker of another host gets a copy with each task.
+
+    ``options`` are ``joblib.Parallel``'s ``max_nbytes`` and ``mmap_mode``.  An array is large with
+    more than ``max_nbytes`` bytes; tasks see it as ``mmap_mode`` says: "r" is read-only.  Arrays
+    within an argument, a list or a table, are not looked for.
+    """
+
+    def __init__(self, options: Mapping[str, Any], *, same_host: bool) -> None:
+        self._max_nbytes: int | None = options.get("max_nbytes")
+        self._mode: str | None = options.get("mmap_mode")
+        self._same_host = same_host
+        self._sent: dict[int, weakref.ref[Any]] = {}
+        self._shared: dict[int, SharedBuffer] = {}
+
+    def of(self, batch: Any) -> Any:
+        """The batch, to be pickled at once and sent."""
+        if not isinstance(batch, BatchedCalls):
+            return batch
+        sent = copy.copy(batch)
+        sent.items = [
+            (func, tuple(map(self._one, args)), {key: self._one(kwargs[key]) for key in kwargs})
+            for func, args, kwargs in batch.items
+        ]
+        return sent
+
+    def close(self) -> None:
+        """Forget what was shared; who maps it still has it."""
+        self._sent.clear()
+        self._shared.clear()
+
+    def _one(self, value: Any) -> Any:
+        if type(value) not in (np.ndarray, np.memmap) or value.dtype.hasobject:
+            return value
+        mapped = _get_backing_memmap(value) if self._same_host else None
+        if isinstance(mapped, np.memmap):  # and not memory without a name
+            return _Reduced(*_reduce_memmap_backed(value, mapped))
+        if self._max_nbytes is None or self._mode is None or value.nbytes <= self._max_nbytes:
+            return value
+        buffer = self._buffer(value) if self._same_host else None
+        if buffer is None:
+            return _Reduced(_read_only, (value,)) if self._mode == "r" else value
+        order = "F" if value.flags.fnc else "C"
+        return _Reduced(_array, (buffer, value.dtype, value.shape, order, self._mode))
+
+    def _buffer(self, array: Any) -> SharedBuffer | None:
+        """The memory that has a copy of it; None if it is to be pickled."""
+        number = id(array)
+        again = number in self._sent
+        if number in self._shared:
+            return self._shared[number]
+        if not again:
+            self._sent[number] = weakref.ref(array, lambda _: self._forget(number))
+        if not (again or self._mode in ("r+", "w+")) or len(self._shared) >= _SHARED_ARRAYS:
+            return None
+        buffer = shared_buffer.allocate(array.nbytes)
+        order = "F" if array.flags.fnc else "C"
+        _array(buffer, array.dtype, array.shape, order, "w+")[...] = array
+        return self._shared.setdefault(number, buffer)
+
+    def _forget(self, number: int) -> None:
+        self._sent.pop(number, None)
+        self._shared.pop(number, None)
+
+
+class _Reduced:
+    """Stand-in that unpickles to the object that its arguments describe."""
+
+    def __init__(self, *reduction: Any) -> None:
+        self._reduction = reduction
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return self._reduction
+
+
+def _array(buffer: SharedBuffer, dtype: Any, shape: tuple[int, ...], order: Any, mode: str) -> Any:
+    array = np.ndarray(shape, dtype, buffer.view, order=order)
+    if mode == "c":  # each task may write to a copy of its own
+        return array.copy(order)
+    return _read_only(array) if mode == "r" else array
+
+
+def _read_only(array: Any) -> Any:
+    array.flags.writeable = False
+    return array
 
 
 register_parallel_backend("fiber", FiberBackend)

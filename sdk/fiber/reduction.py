@@ -63,7 +63,7 @@ _DEPTH = 20
 _BREADTH = 1000
 
 
-class InheritedDescriptor:
+class PayloadDescriptor:
     """A descriptor that travels with the start message, as the payload names it."""
 
     def __init__(self, index: int) -> None:
@@ -74,7 +74,7 @@ class InheritedDescriptor:
         return child.take_descriptor(self._index)
 
 
-class InheritedSegment(InheritedDescriptor):
+class PayloadSegment(PayloadDescriptor):
     """The same for shared memory, of which each block has a handle."""
 
     def detach(self) -> int:
@@ -85,18 +85,18 @@ class InheritedSegment(InheritedDescriptor):
 class Spawning:
     """Collector of descriptors while a Process is pickled: multiprocessing's "spawning popen"."""
 
-    DupFd = InheritedDescriptor
+    DupFd = PayloadDescriptor
 
     def __init__(self, process: Any) -> None:
         self.process = process
         self.fds: list[Descriptor] = []
-        self._segments: dict[int, InheritedSegment] = {}
+        self._segments: dict[int, PayloadSegment] = {}
 
-    def inherit_segment(self, segment: Segment) -> InheritedSegment:
+    def inherit_segment(self, segment: Segment) -> PayloadSegment:
         """Send its descriptor along, once."""
         inherited = self._segments.get(segment.inode)
         if inherited is None:
-            inherited = InheritedSegment(self.duplicate_for_child(segment.fileno()))
+            inherited = PayloadSegment(self.duplicate_for_child(segment.fileno()))
             self._segments[segment.inode] = inherited
         return inherited
 

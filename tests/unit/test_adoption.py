@@ -436,10 +436,10 @@ class TestDuration:
         module = ModuleType("passing")
         vars(module)["multiprocessing"] = multiprocessing
         Adoption(module, fiber)
-        assert module in adoption._states
-        before = len(adoption._states)
+        assert module in adoption._adopted
+        before = len(adoption._adopted)
         del module
-        assert len(adoption._states) == before - 1
+        assert len(adoption._adopted) == before - 1
 
     def test_repr_names_module_and_names(self, module: Any, fiber: Any) -> None:
         assert repr(Adoption(module, fiber)) == "<Adoption of 'library': Queue, multiprocessing>"

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from fiber import _original, config, inherited
+from fiber import _config_sources, config
 from fiber._agent import main as agent
 from fiber.config import Config, load
 from fiber.errors import ConfigError, FiberError
@@ -425,8 +425,8 @@ class TestCurrent:
         assert config.current() == Config(backend="loopback", agents=4)
 
     def test_a_child_has_its_parents_once_it_asks(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(inherited, "_configuration", None)
-        inherited.keep(pickle.dumps(Config(agents=7)))
+        monkeypatch.setattr(_config_sources, "_configuration", None)
+        _config_sources.keep(pickle.dumps(Config(agents=7)))
         assert config.current() == Config(agents=7)
         config.init(agents=8)
         assert config.current().agents == 8
@@ -530,7 +530,7 @@ class TestKeysOfTheOriginal:
         with pytest.raises(ConfigError, match="They cannot be read"):
             load()
 
-    @pytest.mark.parametrize("key", sorted(_original.REPLACEMENTS))
+    @pytest.mark.parametrize("key", sorted(_config_sources.REPLACEMENTS))
     def test_its_keys_have_a_replacement_in_each_source(
         self, key: str, pyproject: Callable[[str], Path]
     ) -> None:

@@ -15,7 +15,7 @@ from multiprocessing import process as mp_process
 from multiprocessing import spawn, util
 from typing import TYPE_CHECKING, Any, Protocol
 
-from fiber import _logs, config, inherited, reduction
+from fiber import _config_sources, _logs, config, reduction
 from fiber._agent import child
 from fiber._agent.interface import ChildHandle, ChildObserver, ChildSpec, ExitReport
 from fiber._hub import client as hub_client
@@ -128,7 +128,7 @@ class Runtime:
         data["authkey"] = bytes(data["authkey"])
         # What such a process starts itself runs on its own host.
         data["calls"] = [
-            (inherited.keep, (pickle.dumps(replace(self.config, backend="local")),)),
+            (_config_sources.keep, (pickle.dumps(replace(self.config, backend="local")),)),
             (start_methods.inherit, (start_methods.chosen, start_methods.preload)),
         ]
         data["same_host"] = same_host

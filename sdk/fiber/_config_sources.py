@@ -1,9 +1,29 @@
-"""The configuration of uber's Fiber, whose package has the same name: what to use in its place."""
+"""Configuration from elsewhere: from the parent process, and from uber's Fiber.
+
+A child keeps its parent's configuration pickled until it is asked for.  Most children never ask,
+and importing ``fiber.config`` takes longer than their start.
+
+Uber's Fiber has a package of the same name, and a file of settings that this one does not read.
+"""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
+
+_configuration: bytes | None = None
+
+
+def keep(pickled: bytes) -> None:
+    """Keep the pickled ``Config`` of the parent, in a child."""
+    global _configuration
+    _configuration = pickled
+
+
+def configuration() -> bytes | None:
+    """Return the pickled ``Config`` of the parent; None in a program."""
+    return _configuration
+
 
 FILE = ".fiberconfig"
 
