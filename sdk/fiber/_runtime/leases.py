@@ -56,7 +56,7 @@ ADOPTED = NoOutcome()
 
 
 class LeasedWorker:
-    """What happened to a leased worker while a caller used it.  Only ``Leases`` changes it."""
+    """Record of a leased worker while a caller uses it.  Only ``Leases`` changes it."""
 
     __slots__ = ("answer", "draining", "handle", "report", "seq", "unread")
 
