@@ -149,7 +149,7 @@ def test_a_start_within_a_start_does_not_mix_them_up(pipe: tuple[Any, Any]) -> N
 def test_a_descriptor_is_taken_once(monkeypatch: pytest.MonkeyPatch) -> None:
     fd = os.dup(1)
     monkeypatch.setattr(child, "_descriptors", [fd])
-    handle = reduction.InheritedDescriptor(0)
+    handle = reduction.PayloadDescriptor(0)
     assert handle.detach() == fd
     with pytest.raises(RuntimeError, match="descriptor 0 of the start message was taken twice"):
         handle.detach()
