@@ -55,6 +55,17 @@ ANNOTATIONS_KEEP_NODE: Final = {
 ANNOTATION_CONNECTED: Final = f"{GROUP}/connected-agents"
 """Of a master's Lease: how many agents were linked to it when it was renewed."""
 
+# -- The sign that an operator serves a namespace
+
+SERVING_LEASE: Final = f"operator.{GROUP}"
+"""The Lease that each operator renews where it serves.  Several operators may write it: a fresh one
+says that an operator lives.  ``operator_lease_name`` never gives this name."""
+SERVING_NAMESPACE: Final = "kube-public"
+"""Where that Lease is if the operator serves all namespaces; else in each that it serves.  Every
+cluster has this namespace."""
+SERVING_SECONDS: Final = 300
+"""How long the Lease is fresh: longer than a restart or an upgrade of the operator takes."""
+
 # -- The worker container
 
 WORKER_CONTAINER: Final = "worker"

@@ -21,6 +21,12 @@ def parse_time(text: str) -> float:
         raise ValueError(f"{text!r} is no time such as 2026-11-21T14:56:13Z") from None
 
 
+def format_micro_time(seconds: float) -> str:
+    """Return the same as a Lease has it, with microseconds."""
+    moment = datetime.datetime.fromtimestamp(seconds, datetime.UTC)
+    return moment.isoformat(timespec="microseconds").replace("+00:00", "Z")
+
+
 def format_time(seconds: float) -> str:
     """The same in the API's words, in UTC, to the second below.
 

@@ -12,12 +12,12 @@ as long as it may last, so that none is under way when others may begin::
 from __future__ import annotations
 
 import asyncio
-import datetime
 import logging
 import time
 from collections.abc import Callable
 from typing import Any
 
+from fiber_api.times import format_micro_time
 from fiber_operator.cluster import LEASES, ApiError, Body, Cluster, Conflict, Gone, Unavailable
 from fiber_operator.logs import about
 
@@ -172,8 +172,7 @@ class LeaderElector:
 
     async def _write(self, lease: Body | None, *, holder: str, seconds: int) -> Body:
         spec = _spec(lease)
-        now = datetime.datetime.fromtimestamp(self._wall_clock(), datetime.UTC)
-        stamp = now.isoformat(timespec="microseconds").replace("+00:00", "Z")
+        stamp = format_micro_time(self._wall_clock())
         fresh = (spec.get("holderIdentity") or "") != self._identity
         transitions = spec.get("leaseTransitions")
         turns = transitions if isinstance(transitions, int) else 0

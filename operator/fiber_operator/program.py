@@ -29,6 +29,7 @@ from fiber_operator.creation import Draw, draw_suffix
 from fiber_operator.event_recorder import EventRecorder
 from fiber_operator.handlers import Configure, Watcher
 from fiber_operator.health import Health
+from fiber_operator.heartbeat import Heartbeat
 from fiber_operator.leader_election import LeaderElector
 from fiber_operator.lease_monitor import LeaseMonitor
 from fiber_operator.metrics import Metrics
@@ -78,7 +79,7 @@ class Program:
         async with contextlib.AsyncExitStack() as stack:
             self._build(
                 await self._open(stack, settings.connections, permit=self._permit),
-                # Their own, so that no queue of other calls keeps a Lease from being renewed.
+                # For Leases alone, so that no queue of other calls keeps one from being renewed.
                 await self._open(stack, 2),
             )
             self.port = await stack.enter_async_context(
@@ -140,6 +141,13 @@ class Program:
             seconds=settings.resync_seconds,
             on_success=lambda: self.metrics.resynced(self._now()),
         )
+        self.heartbeat = Heartbeat(
+            lease_cluster,
+            namespaces=settings.namespaces,
+            identity=settings.identity,
+            serves=lambda namespace: self.elector.is_leader and self.resync.lists(namespace),
+            wall_clock=self._now,
+        )
         self.watches = Watches(settings.namespaces)
         self.health = Health(self.elector, self.queue, self.resync, self.watches, clock)
         self.metrics.watch_queue(self.queue.statistics, lambda: self.elector.is_leader)
@@ -159,6 +167,7 @@ class Program:
             self.lease_monitor,
             self.queue,
             self.resync,
+            self.heartbeat,
             self.recorder,
             watcher,
         ]

@@ -47,6 +47,10 @@ class Resync:
     def seconds(self) -> float:
         return self._seconds
 
+    def lists(self, namespace: str) -> bool:
+        """Return True if the pools of the namespace (empty: of all) were listed the last time."""
+        return self.tried is not None and namespace not in self.failures
+
     def poke(self) -> None:
         """List the pools now."""
         self._poked.set()

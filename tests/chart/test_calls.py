@@ -17,6 +17,7 @@ from fakes import virtual_time
 from fakes.kubernetes_api import Call
 from fakes.store import KINDS
 from fakes.world import NAMESPACE, World, a_world, configuration
+from fiber_api.names import SERVING_LEASE, SERVING_NAMESPACE
 from fiber_operator import handlers
 from fiber_operator.cluster import Configuration
 from fiber_operator.event_recorder import PAUSE
@@ -141,7 +142,8 @@ def rights(calls: Iterable[Call], where: Callable[[Call], bool]) -> set[Right]:
 
 def test_what_it_may_do_to_pools_is_what_it_does(helm: Helm, calls: list[Call]) -> None:
     role = named(helm.render(), "ClusterRole", f"{OWN}:fiber-fiber-operator")
-    assert rights(calls, lambda call: call.namespace != OWN) == set(allowed(role))
+    places = (OWN, SERVING_NAMESPACE)
+    assert rights(calls, lambda call: call.namespace not in places) == set(allowed(role))
 
 
 def test_what_it_may_do_to_its_lease_is_what_it_does(helm: Helm, calls: list[Call]) -> None:
@@ -150,3 +152,13 @@ def test_what_it_may_do_to_its_lease_is_what_it_does(helm: Helm, calls: list[Cal
     (names,) = (rule["resourceNames"] for rule in role["rules"] if "resourceNames" in rule)
     renewed = {call.name for call in calls if call.namespace == OWN and call.verb == "update"}
     assert {name.replace("fiber-fiber-operator", "fiber-operator") for name in names} == renewed
+
+
+def test_what_it_may_do_to_show_that_it_serves_is_what_it_does(
+    helm: Helm, calls: list[Call]
+) -> None:
+    role = named(helm.render(), "Role", f"{OWN}:fiber-fiber-operator-serving-lease")
+    assert role["metadata"]["namespace"] == SERVING_NAMESPACE
+    assert rights(calls, lambda call: call.namespace == SERVING_NAMESPACE) == set(allowed(role))
+    (names,) = (rule["resourceNames"] for rule in role["rules"] if "resourceNames" in rule)
+    assert names == [SERVING_LEASE]

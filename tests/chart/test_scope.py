@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from chart.helm import NAMESPACE, Helm, Manifest, is_hook, kinds, named
-from fiber_api.names import operator_lease_name
+from chart.helm import NAMESPACE, Helm, Manifest, allowed, is_hook, kinds, named
+from fiber_api.names import SERVING_LEASE, operator_lease_name
 from fiber_operator.settings import Settings
 
 CLUSTER: dict[str, Any] = {"scope": "cluster"}
@@ -82,6 +82,37 @@ def test_settings_and_rights_agree(
 def test_the_rights_are_the_same_in_each_scope(helm: Helm) -> None:
     everywhere = granted(helm.render(CLUSTER))[""]
     assert granted(helm.render(TWO)) == {"team-a": everywhere, "team-b": everywhere}
+
+
+@pytest.mark.parametrize(
+    ("values", "places"),
+    [(CLUSTER, ["kube-public"]), (OWN, [NAMESPACE]), (TWO, ["team-a", "team-b"])],
+    ids=["cluster", "own", "two"],
+)
+def test_it_shows_that_it_serves_where_programs_may_look(
+    helm: Helm, values: dict[str, Any], places: list[str]
+) -> None:
+    manifests = helm.render(values)
+    writers = [
+        manifest
+        for manifest in manifests
+        if manifest["kind"] == "RoleBinding"
+        and manifest["metadata"]["name"].endswith("-serving-lease")
+    ]
+    assert [writer["metadata"]["namespace"] for writer in writers] == places
+    assert all(writer["subjects"] == [subject("fiber-fiber-operator")] for writer in writers)
+    here = [role for role in manifests if role["metadata"].get("namespace") == "kube-public"]
+    if places != ["kube-public"]:
+        assert not here
+        users = [role for role in manifests if role["metadata"]["name"] == "fiber-user"]
+        assert [role["metadata"]["namespace"] for role in users] == places
+        assert all(("coordination.k8s.io", "leases", "get") in allowed(role) for role in users)
+        return
+    binding = named(here, "RoleBinding", "fiber-serving-viewer")
+    assert [entry["name"] for entry in binding["subjects"]] == ["system:authenticated"]
+    role = named(here, "Role", "fiber-serving-viewer")
+    assert list(allowed(role)) == [("coordination.k8s.io", "leases", "get")]
+    assert [rule["resourceNames"] for rule in role["rules"]] == [[SERVING_LEASE]]
 
 
 def test_namespaced_makes_nothing_of_the_cluster_but_the_resource_type(helm: Helm) -> None:

@@ -75,7 +75,9 @@ def test_pools_of_different_names_share_no_object() -> None:
 @example("operator", "fiber-operator")
 @example("fiber-operator", "fiber-fiber-operator")
 def test_no_masters_lease_is_an_operators(pool: str, release: str) -> None:
-    assert names.master_lease_name(pool) != names.operator_lease_name(release)
+    operators = {names.operator_lease_name(release), names.SERVING_LEASE}
+    assert names.master_lease_name(pool) not in operators
+    assert len(operators) == 2
 
 
 def test_no_secret_is_called_as_cert_managers_usually_are() -> None:

@@ -7,7 +7,7 @@ import concurrent.futures
 import contextlib
 import threading
 from collections.abc import Callable, Iterator
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from fakes.agent_kubelet import AgentKubelet
 from fakes.store import Body
@@ -57,13 +57,14 @@ class FakeCluster:
 
 
 @contextlib.contextmanager
-def fake_cluster() -> Iterator[FakeCluster]:
-    """A new one with nothing in it but an operator."""
+def fake_cluster(**settings: Any) -> Iterator[FakeCluster]:
+    """A new one with nothing in it but an operator, which has these settings."""
     started: concurrent.futures.Future[FakeCluster] = concurrent.futures.Future()
     end = asyncio.Event()
 
     async def serve() -> None:
-        async with a_world() as world:
+        async with a_world(**settings) as world:
+            world.store.follow_the_machine()
             nodes = AgentKubelet(world.store)
             started.set_result(FakeCluster(world, nodes, asyncio.get_running_loop()))
             await end.wait()

@@ -94,6 +94,8 @@ class KubernetesApi:
         """Every connection is reset, as with an API server that is gone."""
         self.accepts: set[str] | None = None
         """Values of Authorization that are let in; None: anybody."""
+        self.allows: Callable[[Call], bool] = lambda call: True
+        """Whether those who send a token may make such a call; others may make all."""
         self.port = 0
         self.server: Callable[[], asyncio.Protocol]
         """Makes the protocol of a connection, for clients that need no socket."""
@@ -136,6 +138,8 @@ class KubernetesApi:
         found = discovery(request.path)
         if found is not None:
             return web.json_response(found)
+        if request.path == _REVIEWS:
+            return web.json_response(self._review(await request.json()))
         call = _parse(request)
         if call is None:
             return web.Response(status=404, text="404 page not found")
@@ -143,6 +147,8 @@ class KubernetesApi:
         self.tokens += request.headers.getall("Authorization", [])
         if self.accepts is not None and request.headers.get("Authorization") not in self.accepts:
             return _refused(Failure(401, "Unauthorized", "Unauthorized"))
+        if "Authorization" in request.headers and not self.allows(call):
+            return _refused(Failure(403, "Forbidden", f"you may not {call.verb} {call.plural}"))
         fault = next((fault for fault in self.faults if fault.strikes(call)), None)
         if fault is not None and fault.late:
             await asyncio.sleep(fault.late)
@@ -158,6 +164,11 @@ class KubernetesApi:
             assert answer is not None
             return answer
         return _faulty(request, fault)
+
+    def _review(self, body: Body) -> Body:
+        asked = body["spec"]["resourceAttributes"]
+        call = Call(asked["verb"], asked["resource"], asked["namespace"])
+        return {**body, "status": {"allowed": self.allows(call)}}
 
     async def _carry_out(self, request: web.Request, call: Call) -> web.StreamResponse:
         body = json.loads(await request.read() or b"{}")
@@ -274,6 +285,7 @@ class KubernetesApi:
         return not self.down
 
 
+_REVIEWS = "/apis/authorization.k8s.io/v1/selfsubjectaccessreviews"
 _VERBS = {"POST": "create", "PUT": "update", "PATCH": "patch", "DELETE": "delete"}
 
 

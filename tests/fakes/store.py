@@ -69,6 +69,8 @@ class Store:
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
+        self.epoch = EPOCH
+        """Time at which the clock shows 0."""
         self._objects: dict[Place, Body] = {}
         self._version = 100
         self._addresses = 0
@@ -98,11 +100,16 @@ class Store:
 
     def now(self) -> str:
         """The time as Kubernetes writes it."""
-        moment = EPOCH + datetime.timedelta(seconds=self._clock())
+        moment = self.epoch + datetime.timedelta(seconds=self._clock())
         return moment.isoformat(timespec="seconds").replace("+00:00", "Z")
 
     def unix_now(self) -> float:
-        return EPOCH.timestamp() + self._clock()
+        return self.epoch.timestamp() + self._clock()
+
+    def follow_the_machine(self) -> None:
+        """Show the time of this machine from now on, as programs of this machine do."""
+        now = datetime.datetime.now(datetime.UTC)
+        self.epoch = now - datetime.timedelta(seconds=self._clock())
 
     # -- What clients do
 

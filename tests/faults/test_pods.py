@@ -31,7 +31,7 @@ from patience import PATIENCE
 from unit.kubernetes_rig import kubeconfig
 
 KEPT = ("fiberpools", "pods", "secrets", "leases", "services", "endpointslices")
-OPERATORS = {names.operator_lease_name("fiber-operator"), "fiberpools.fiber.dev"}
+OPERATORS = {names.operator_lease_name("fiber-operator"), names.SERVING_LEASE}
 """Leases that stay."""
 
 

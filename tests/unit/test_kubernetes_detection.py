@@ -14,6 +14,10 @@ from fiber.errors import ConfigError
 from fiber_api import names
 
 ALLOWED = {"status": {"allowed": True}}
+LEASE = "/apis/coordination.k8s.io/v1/namespaces/{}/leases/operator.fiber.dev"
+FRESH = {"renewTime": "9000-01-01T00:00:00.000000Z", "leaseDurationSeconds": 300}
+OLD = {"renewTime": "2020-01-01T00:00:00.000000Z", "leaseDurationSeconds": 300}
+FORBIDDEN = Forbidden("you may not", status=403)
 
 
 class Account:
@@ -24,8 +28,9 @@ class Account:
     def __init__(self, answer: dict[str, Any] | Exception) -> None:
         self._answer = answer
         self.served = True
-        self.refusal: Exception | None = None
-        self.pools: list[dict[str, Any]] = []
+        self.leases: dict[str, dict[str, Any] | Exception] = {"kube-public": {"spec": FRESH}}
+        """What the API server answers about an operator's Lease, by namespace."""
+        self.got: list[str] = []
         self.asked: list[dict[str, Any]] = []
         self.closed = False
 
@@ -44,16 +49,15 @@ class Account:
 
     def get(self, path: str, *, timeout: float) -> dict[str, Any]:
         assert timeout <= 5.0
+        self.got.append(path)
         if path == "/apis/fiber.dev/v1alpha1" and self.served:
             return {}
+        for namespace, answer in self.leases.items():
+            if path == LEASE.format(namespace):
+                if isinstance(answer, Exception):
+                    raise answer
+                return answer
         raise NotFound("404 page not found", status=404)
-
-    def list(self, path: str, selector: dict[str, str], *, timeout: float) -> dict[str, Any]:
-        assert timeout <= 5.0
-        assert path.endswith("/fiberpools")
-        if self.refusal is not None:
-            raise self.refusal
-        return {"items": self.pools}
 
     def close(self) -> None:
         self.closed = True
@@ -72,6 +76,7 @@ def test_a_pod_whose_account_may_make_pools_has_pods(monkeypatch: pytest.MonkeyP
     assert account.asked == [
         {"group": names.GROUP, "resource": names.PLURAL, "verb": "create", "namespace": "lab"}
     ]
+    assert account.got == [LEASE.format("kube-public")]
     assert account.closed
 
 
@@ -116,49 +121,67 @@ def test_outside_of_pods_nobody_is_asked(monkeypatch: pytest.MonkeyPatch) -> Non
     assert account.asked == []
 
 
+def lines(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [record.getMessage() for record in caplog.records if record.name == "fiber"]
+
+
 def test_without_fiber_pools_processes_run_here_with_a_warning(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     account = in_a_pod(monkeypatch, ALLOWED)
-    account.served = False
+    account.served, account.leases = False, {}
     assert not _is_on_cluster(Config())
-    assert "the cluster knows no FiberPools" in caplog.text
-
-
-SEEN, NEW, OLD = {"observedGeneration": 1}, "9000-01-01T00:00:00Z", "2020-01-01T00:00:00Z"
-
-
-def pool(created: str, status: dict[str, Any] | None = None) -> dict[str, Any]:
-    return {"metadata": {"creationTimestamp": created}, **({"status": status} if status else {})}
+    (line,) = lines(caplog)
+    assert "the cluster knows no FiberPools" in line
 
 
 @pytest.mark.parametrize(
-    ("pools", "taken"),
-    [
-        ([], True),
-        ([pool(OLD, SEEN)], True),
-        ([pool(OLD), pool(OLD, SEEN)], True),
-        ([pool(NEW)], True),
-        ([pool(OLD), pool(NEW)], True),
-        ([{"metadata": {}}], True),
-        ([pool(OLD)], False),
-        ([pool(OLD), pool(OLD, {"phase": "Pending"})], False),
-    ],
-    ids=["none", "seen", "one-seen", "new", "one-new", "no-time", "waits", "both-wait"],
+    "public",
+    [None, {"spec": OLD}, FORBIDDEN],
+    ids=["no-public-lease", "an-old-public-lease", "an-unreadable-public-lease"],
 )
-def test_pools_that_wait_in_vain_show_that_no_operator_serves_them(
-    pools: list[dict[str, Any]],
-    taken: bool,
+def test_an_operator_of_this_namespace_alone_is_found(
+    public: dict[str, Any] | Exception | None,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     account = in_a_pod(monkeypatch, ALLOWED)
-    account.pools = pools
-    assert _is_on_cluster(Config()) == taken
-    assert ("no operator serves" in caplog.text) != taken
-
-
-def test_pools_that_may_not_be_listed_show_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    account = in_a_pod(monkeypatch, ALLOWED)
-    account.refusal = Forbidden("no", status=403)
+    account.leases = {"lab": {"spec": FRESH}, **({"kube-public": public} if public else {})}
     assert _is_on_cluster(Config())
+    assert account.got == [LEASE.format("kube-public"), LEASE.format("lab")]
+    assert lines(caplog) == []
+
+
+@pytest.mark.parametrize(
+    ("leases", "says"),
+    [
+        ({}, "does not exist in the namespace 'kube-public' and does not exist in the namespace"),
+        ({"other": {"spec": FRESH}}, "does not exist in the namespace 'lab'"),
+        (
+            {"kube-public": {"spec": OLD}},
+            "was last renewed at 2020-01-01T00:00:00Z in the namespace 'kube-public'",
+        ),
+        ({"lab": {"spec": OLD}}, "was last renewed at 2020-01-01T00:00:00Z in the namespace 'lab'"),
+        ({"kube-public": {}}, "has no time"),
+        ({"kube-public": {"spec": {**FRESH, "leaseDurationSeconds": "?"}}}, "has no time"),
+        (
+            {"kube-public": FORBIDDEN, "lab": FORBIDDEN},
+            "may not be read in the namespace 'kube-public' and may not be read in the namespace",
+        ),
+        ({"kube-public": Unreachable("no route")}, "the API server does not say"),
+    ],
+    ids=["none", "elsewhere", "dead", "dead-here", "empty", "damaged", "no-right", "no-answer"],
+)
+def test_without_a_fresh_lease_processes_run_here_and_one_line_says_why(
+    leases: dict[str, dict[str, Any] | Exception],
+    says: str,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    account = in_a_pod(monkeypatch, ALLOWED)
+    account.leases = leases
+    assert not _is_on_cluster(Config())
+    (line,) = lines(caplog)
+    assert says in line
+    assert "backend='local'" in line
+    assert len(account.got) <= 3

@@ -4,6 +4,8 @@ calls that the operator makes, both ways.
 
   pools    the operator, in each namespace that it watches
   own      the operator, in its own namespace: the Lease that keeps two of its processes from acting at once
+  serving  the operator, where it shows that it serves: in each namespace that it watches, or in kube-public for all
+  anyone   everybody who is logged in, in kube-public: whether an operator serves all namespaces
   user     programs that are masters: what the SDK calls, and nothing else
   viewer   who looks on: people
   smoke    the helm test
@@ -51,6 +53,19 @@ own:
     resources: [leases]
     resourceNames: [{{ include "fiber-operator.leaseName" . }}]
     verbs: [get, update]
+serving:
+  - apiGroups: [coordination.k8s.io]
+    resources: [leases]
+    verbs: [create]
+  - apiGroups: [coordination.k8s.io]
+    resources: [leases]
+    resourceNames: [operator.fiber.dev]
+    verbs: [patch]
+anyone:
+  - apiGroups: [coordination.k8s.io]
+    resources: [leases]
+    resourceNames: [operator.fiber.dev]
+    verbs: [get]
 user:
   - apiGroups: [fiber.dev]
     resources: [fiberpools]
@@ -61,6 +76,7 @@ user:
     resources: [secrets]
     verbs: [create]
   # A master renews a Lease, so that its pool is not kept for a program that is gone. What it made goes with the pool.
+  # Get: also the Lease by which an operator of this namespace alone shows that it serves.
   - apiGroups: [coordination.k8s.io]
     resources: [leases]
     verbs: [create, get, patch, update]

@@ -1,7 +1,7 @@
 """Recognition of files that hold secrets: keys, passwords and tokens.
 
-The name of a file decides, or that of a folder around it, or the contents of a small file.  Modules are
-judged by their name alone: a program cannot run without its code.
+The name of a file decides, or that of a folder around it, or the contents of a small file.
+Modules are judged by their name alone: a program cannot run without its code.
 """
 
 from __future__ import annotations

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import base64
 import contextlib
-import datetime
 import json
 import threading
 import time
@@ -32,6 +31,7 @@ from fiber.errors import FiberPoolError
 from fiber_api import identity, names
 from fiber_api.identity import InvalidKey
 from fiber_api.names import ConditionType
+from fiber_api.times import format_micro_time
 
 LOST = ("Deleted", "Replaced")
 """Reasons of a FiberPoolError by which the pool is this program's no more."""
@@ -244,8 +244,7 @@ def identity_in(pool: Body) -> str | None:
 
 
 def _micro_time() -> str:
-    now = datetime.datetime.now(datetime.UTC)
-    return now.isoformat(timespec="microseconds").replace("+00:00", "Z")
+    return format_micro_time(time.time())
 
 
 def secret_body(

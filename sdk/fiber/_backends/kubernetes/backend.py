@@ -11,8 +11,8 @@ import time
 from functools import partial
 
 from fiber._agent.interface import ChildObserver, ChildSpec
-from fiber._backends.kubernetes.api import POOLS, Api
-from fiber._backends.kubernetes.api_errors import ApiError, Body, NotFound
+from fiber._backends.kubernetes.api import LEASES, Api
+from fiber._backends.kubernetes.api_errors import ApiError, Body, Forbidden, NotFound
 from fiber._backends.kubernetes.pods import Pods
 from fiber._backends.kubernetes.program import Program
 from fiber._backends.kubernetes.template import Shape
@@ -23,7 +23,7 @@ from fiber._transport.loop import Loop
 from fiber.config import Config
 from fiber.errors import ConfigError
 from fiber_api import names
-from fiber_api.times import parse_time
+from fiber_api.times import format_time, parse_time
 
 
 class KubernetesBackend:
@@ -87,16 +87,12 @@ _REVIEWS = "/apis/authorization.k8s.io/v1/selfsubjectaccessreviews"
 
 _TIMEOUT = 5.0
 """Seconds that a program may wait for an answer before it goes on without a cluster."""
-_PATIENCE = 60.0
-"""Seconds in which an operator reports on a new pool.  Clocks of two machines may differ."""
-_EXAMINED = 20
-"""Number of pools that are looked at."""
 
 
 def serves_pools(namespace: str | None) -> bool:
     """Return True if this pod's account may make FiberPools and an operator serves them.
 
-    If the account has the right and FiberPools or an operator are missing, a warning says so.
+    If the account has the right and an operator does not show that it lives, a warning says so.
     """
     try:
         with contextlib.closing(Api.connect()) as api:
@@ -109,15 +105,25 @@ def _serves(api: Api, namespace: str) -> bool:
     answer = api.create(_REVIEWS, _review(namespace), timeout=_TIMEOUT)
     if not answer.get("status", {}).get("allowed"):
         return False
+    missing = []
     try:
+        for place in dict.fromkeys((names.SERVING_NAMESPACE, namespace)):
+            why = _why_not_served(api, place)
+            if why is None:
+                return True
+            missing.append(f"{why} in the namespace {place!r}")
         api.get(f"/apis/{names.API_VERSION}", timeout=_TIMEOUT)
     except NotFound:
         return _on_this_machine("the cluster knows no FiberPools. Install the operator's chart")
-    if _is_unserved(api, namespace):
+    except ApiError as error:
         return _on_this_machine(
-            f"no operator serves the FiberPools of the namespace {namespace!r}. Start the operator"
+            f"the API server does not say whether an operator serves the namespace {namespace!r} "
+            f"({error.message}). Set backend='kubernetes' to try again"
         )
-    return True
+    return _on_this_machine(
+        f"no operator shows that it serves the namespace {namespace!r}: its Lease "
+        f"{names.SERVING_LEASE} {' and '.join(missing)}. Start or install the operator"
+    )
 
 
 def _on_this_machine(why: str) -> bool:
@@ -129,29 +135,22 @@ def _on_this_machine(why: str) -> bool:
     return False
 
 
-def _is_unserved(api: Api, namespace: str) -> bool:
-    """Return True if the namespace's oldest FiberPools have waited in vain for an operator.
-
-    An operator reports in a pool's status which generation of the spec it has seen.  A namespace
-    without pools, or one whose pools may not be listed, tells nothing.
-    """
+def _why_not_served(api: Api, place: str) -> str | None:
+    """Return why the Lease there does not show a living operator; None if it does."""
     try:
-        found = api.list(POOLS.path(namespace), {"limit": str(_EXAMINED)}, timeout=_TIMEOUT)
-    except ApiError:
-        return False
-    waiting = [_has_waited(pool) for pool in found.get("items") or []]
-    return bool(waiting) and all(waiting)
-
-
-def _has_waited(pool: Body) -> bool:
-    """Return True if no operator has ever reported on the pool, though it had time to."""
-    if "observedGeneration" in (pool.get("status") or {}):
-        return False
+        lease = api.get(LEASES.path(place, names.SERVING_LEASE), timeout=_TIMEOUT)
+    except NotFound:
+        return "does not exist"
+    except Forbidden:
+        return "may not be read"
+    spec = lease.get("spec") or {}
     try:
-        created = parse_time(str(pool["metadata"].get("creationTimestamp")))
-    except ValueError:
-        return False
-    return created + _PATIENCE < time.time()
+        renewed = parse_time(str(spec.get("renewTime")))
+        fresh_until = renewed + int(spec.get("leaseDurationSeconds") or 0)
+    except (TypeError, ValueError):
+        return "has no time"
+    # The clocks of two machines: they differ by less than an operator's restart takes.
+    return None if time.time() < fresh_until else f"was last renewed at {format_time(renewed)}"
 
 
 def _review(namespace: str) -> Body:
