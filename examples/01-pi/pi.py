@@ -12,7 +12,7 @@ import fiber
 
 
 def worker(p):
-    # Runs in the pool, once for every dart: did it land inside of the quarter circle?
+    # Runs in the pool, once for every dart: did it land inside the quarter circle?
     return random.random() ** 2 + random.random() ** 2 < 1
 
 

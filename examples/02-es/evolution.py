@@ -1,4 +1,4 @@
-"""Evolution strategies (Salimans et al. 2017): no process and no environment in here.
+"""Evolution strategies (Salimans et al. 2017), without processes or environments.
 
 Each generation asks for the returns of pairs of mirrored perturbations, theta + sigma * noise and
 theta - sigma * noise, and moves theta to where the returns are higher.
@@ -16,9 +16,9 @@ Vector = npt.NDArray[np.float32]
 
 
 class Candidate(NamedTuple):
-    """A mirrored pair to evaluate: where its noise starts in the table, and the episode's seed.
+    """Mirrored pair to evaluate: where its noise starts in the table, and the episode's seed.
 
-    Both halves play the same episode, so that their difference is due to the noise alone.
+    Both halves play the same episode, so that only the noise makes a difference.
     """
 
     noise_index: int
@@ -26,7 +26,7 @@ class Candidate(NamedTuple):
 
 
 class Evolution:
-    """The search distribution and how it moves: ask for `candidates`, then `update`."""
+    """Search distribution and its movement: ask for `candidates`, then `update`."""
 
     def __init__(
         self,
@@ -44,7 +44,7 @@ class Evolution:
         self._adam = Adam(theta.size, learning_rate)
 
     def candidates(self, pairs: int) -> list[Candidate]:
-        """The pairs of the next generation, each with other noise."""
+        """Return the pairs of the next generation, each with other noise."""
         starts = self._noise.size - self.theta.size + 1
         indices = self._rng.choice(starts, pairs, replace=False)
         seeds = self._rng.integers(2**31, size=pairs)
@@ -53,7 +53,7 @@ class Evolution:
     def update(self, returns: Mapping[int, tuple[float, float]]) -> None:
         """Move theta, given the returns (plus, minus) of each noise index.
 
-        The order in which the returns arrived makes no difference, not even in the last bit.
+        The order in which the returns arrive makes no difference, not even in the last bit.
         """
         indices = sorted(returns)
         shaped = centred_ranks(np.array([returns[index] for index in indices]))
@@ -66,8 +66,8 @@ class Evolution:
 def centred_ranks(returns: npt.NDArray[np.float64]) -> Vector:
     """Replace returns by their ranks, from -0.5 for the worst to 0.5 for the best.
 
-    It makes the update indifferent to the scale of the returns and to outliers. Equal returns
-    get equal ranks: episodes that ran out of time say nothing about each other.
+    Ranks make the update independent of the scale of the returns and of outliers. Equal returns get
+    equal ranks, because two episodes that ran out of time cannot be compared.
     """
     _, position, counts = np.unique(returns, return_inverse=True, return_counts=True)
     ranks = np.cumsum(counts) - (counts + 1) / 2
@@ -76,7 +76,7 @@ def centred_ranks(returns: npt.NDArray[np.float64]) -> Vector:
 
 
 class Adam:
-    """Adam (Kingma and Ba 2015), upwards, with a short memory: training is short as well."""
+    """Adam (Kingma and Ba 2015), upwards, with a short memory because training is short."""
 
     def __init__(self, size: int, learning_rate: float) -> None:
         self._rate = learning_rate
@@ -86,7 +86,7 @@ class Adam:
         self._steps = 0
 
     def step(self, gradient: Vector) -> Vector:
-        """What to add to the parameters."""
+        """Return the step to add to the parameters."""
         self._steps += 1
         self._mean += (1 - self._decay_mean) * (gradient - self._mean)
         self._square += (1 - self._decay_square) * (gradient**2 - self._square)

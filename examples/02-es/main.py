@@ -101,7 +101,7 @@ def compare(pool: Any, search: Evolution) -> Outcome:
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """The options; what is wrong with them is said before anything starts."""
+    """Return the options; report wrong ones before anything starts."""
     parser = argparse.ArgumentParser(description="Evolution strategies with fiber.Pool.")
     parser.add_argument("--workers", type=int, default=fiber.cpu_count())
     parser.add_argument("--generations", type=int, default=30)

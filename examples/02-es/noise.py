@@ -1,8 +1,8 @@
-"""One table of Gaussian noise per host, shared by all of the processes there.
+"""Table of Gaussian noise, one per host, shared by all of the processes there.
 
-The trick of Salimans et al. (2017): a perturbation is a slice of a big table that everybody has,
-so that a task and its result name it by one integer. The table is a file, mapped into memory
-read-only; the kernel keeps one copy of it, however many processes look into it.
+The trick of Salimans et al. (2017): a perturbation is a slice of a big table that all processes
+have, so that a task and its result name it by one integer. The table is a file, mapped into memory
+read-only. The kernel keeps one copy of it for all processes.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ BLOCK = 1 << 20  # floats made at a time, so that making the table takes little 
 
 @dataclass(frozen=True)
 class NoiseTable:
-    """Names a table of `length` floats; any process that has it can `open` the table.
+    """Name of a table of `length` floats; any process that has it can `open` the table.
 
-    `key` tells tables of different runs apart. The contents depend on `seed` and `length` alone
-    and so are the same on every host.
+    `key` tells tables of different runs apart. The contents depend on `seed` and `length` alone, so
+    they are the same on every host.
     """
 
     key: str
@@ -33,27 +33,28 @@ class NoiseTable:
 
     @property
     def path(self) -> Path:
-        """Where the table is on this host."""
+        """Path of the table on this host."""
         return Path(tempfile.gettempdir()) / f"fiber-es-noise-{self.key}.f32"
 
     def open(self) -> npt.NDArray[np.float32]:
-        """The table, read-only. Whoever on this host asks first makes it."""
+        """Return the table, read-only. The first process on this host to ask makes it."""
         if not self.path.exists():
             self._make()
         return np.memmap(self.path, dtype=np.float32, mode="r", shape=(self.length,))
 
     def remove(self) -> None:
-        """Delete the table on this host; who has it open keeps it until they close it."""
-        # The pattern includes what processes left that were killed while they made the table.
+        """Delete the table on this host; processes that have it open keep it until they close
+        it."""
+        # The pattern also matches files of processes that were killed while they made the table.
         for path in self.path.parent.glob(f"{self.path.stem}*"):
             path.unlink(missing_ok=True)
 
     def _make(self) -> None:
-        """Write the table under another name, then give it its own in one atomic step.
+        """Write the table under another name, then give it its name in one atomic step.
 
-        No lock, so nobody can die holding one. If several start at once, the first to finish
-        names the table and the others throw theirs away. A link, not a rename: a rename would
-        replace a table that others have opened, and there would be two.
+        There is no lock, so no process can die holding one. If several start at once, the first to
+        finish names the table and the others delete theirs. It is a link and not a rename, because
+        a rename would replace a table that others have opened, and there would be two.
         """
         handle, partial = tempfile.mkstemp(prefix=f"{self.path.stem}-", dir=self.path.parent)
         try:
@@ -61,7 +62,7 @@ class NoiseTable:
                 self._write(file)
             os.link(partial, self.path)
         except FileExistsError:
-            pass  # somebody was faster, and theirs is the same
+            pass  # another process was faster, and its table is the same
         finally:
             os.unlink(partial)
 

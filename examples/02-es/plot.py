@@ -1,4 +1,4 @@
-"""The learning curve as a picture."""
+"""Picture of the learning curve."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def write_curve(
     path: Path, title: str, history: Sequence[Generation], outcome: Outcome | None
 ) -> None:
     """Write a picture to `path`: returns by generation and, if known, the outcome beside it."""
-    # Imported here: the workers need none of it. A Figure of its own draws without a display.
+    # Imported here, because the workers do not need it. A separate Figure draws without a display.
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8.6, 4.3), dpi=150, layout="constrained")

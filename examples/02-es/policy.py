@@ -1,7 +1,7 @@
-"""The network that plays, and how it plays one episode.
+"""Policy network that plays, and one episode of it.
 
-To evolution strategies a policy is a flat vector of floats. This module says what such a vector
-means in a given Gymnasium environment.
+To evolution strategies a policy is a flat vector of floats. This module gives such a vector its
+meaning in a Gymnasium environment.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ HIDDEN = 16  # units of the one hidden layer: plenty for classic control
 
 
 def make_env(name: str) -> gym.Env[Any, Any]:
-    """The environment, without Gymnasium's checker, which takes longer than a step."""
+    """Make the environment, without Gymnasium's checker, which takes longer than a step."""
     return gym.make(name, disable_env_checker=True)
 
 
 class Policy:
-    """Gives a vector of `size` parameters its meaning in `env`.
+    """Meaning of a vector of `size` parameters in `env`.
 
-    Raises ValueError for an environment that does not observe a flat vector, or whose actions
-    are neither a choice (Discrete) nor a bounded vector (Box).
+    Raises ValueError for an environment that does not observe a flat vector, or whose actions are
+    neither a choice (Discrete) nor a bounded vector (Box).
     """
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
@@ -38,8 +38,8 @@ class Policy:
                 f"its observations are {seen}, and this example needs flat vectors, "
                 "as of Acrobot-v1, CartPole-v1 or Pendulum-v1"
             )
-        # Observations are divided by their bounds, which every worker knows from the start:
-        # a running mean would have to travel, and would depend on who played what.
+        # Observations are divided by their bounds, which every worker knows from the start. A
+        # running mean would have to travel, and would depend on which worker played what.
         bound = np.maximum(np.abs(seen.low), np.abs(seen.high))
         self._scale = np.where((bound > 0) & (bound < 1e3), bound, 1).astype(np.float32)
         self._to_action, outputs = _decoder(env.action_space)
@@ -49,7 +49,7 @@ class Policy:
         self.size = int(self._ends[-1])
 
     def initial(self, rng: np.random.Generator) -> Vector:
-        """Where training starts: a random hidden layer, and outputs close to zero."""
+        """Return where training starts: a random hidden layer, and outputs close to zero."""
         theta = rng.standard_normal(self.size, dtype=np.float32)
         hidden, hidden_bias, output, output_bias = self._split(theta)
         hidden /= np.sqrt(np.float32(hidden.shape[1]))
@@ -58,7 +58,7 @@ class Policy:
         return theta
 
     def act(self, theta: Vector) -> Act:
-        """The policy with the parameters `theta`: a function from observation to action."""
+        """Return the policy with the parameters `theta`: a function from observation to action."""
         hidden, hidden_bias, output, output_bias = self._split(theta)
         hidden = hidden / self._scale
         to_action = self._to_action
@@ -69,13 +69,13 @@ class Policy:
         return act
 
     def _split(self, theta: Vector) -> list[Vector]:
-        """The layers, as views into `theta`."""
+        """Return the layers, as views into `theta`."""
         parts = np.split(theta, self._ends[:-1])
         return [part.reshape(shape) for part, shape in zip(parts, self._shapes, strict=True)]
 
 
 def _decoder(actions: gym.Space[Any]) -> tuple[Callable[[Vector], Any], int]:
-    """How outputs become an action, and how many outputs that takes."""
+    """Return how outputs become an action, and the number of outputs that this takes."""
     if isinstance(actions, gym.spaces.Discrete):
         first = actions.start
         return (lambda outputs: first + outputs.argmax()), int(actions.n)
@@ -86,7 +86,7 @@ def _decoder(actions: gym.Space[Any]) -> tuple[Callable[[Vector], Any], int]:
 
 
 def play(env: gym.Env[Any, Any], act: Act, seed: int) -> float:
-    """The return of one episode; `seed` decides how it starts."""
+    """Return the return of one episode; `seed` decides how it starts."""
     observation, _ = env.reset(seed=seed)
     total, over = 0.0, False
     while not over:
@@ -97,6 +97,6 @@ def play(env: gym.Env[Any, Any], act: Act, seed: int) -> float:
 
 
 def play_randomly(env: gym.Env[Any, Any], seed: int) -> float:
-    """The return of one episode of random actions: what training is compared with."""
+    """Return the return of one episode of random actions, to compare training with."""
     env.action_space.seed(seed)
     return play(env, lambda _: env.action_space.sample(), seed)

@@ -1,4 +1,4 @@
-"""A progress bar in the last line of a terminal; nothing but the lines where there is none."""
+"""Progress bar in the last line of a terminal; without a terminal only the lines."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ ERASE_LINE = "\r\x1b[K"
 
 
 class Progress:
-    """Counts up to `total`; as a context manager, it takes its bar away at the end."""
+    """Counter up to `total`; as a context manager, it removes its bar at the end."""
 
     def __init__(self, total: int, unit: str) -> None:
         self._total = total
@@ -34,7 +34,7 @@ class Progress:
         self._erase()
 
     def advance(self, count: int) -> None:
-        """So many more are done."""
+        """Count so many more as done."""
         self._done += count
         now = time.monotonic()
         if self._visible and now >= self._next_draw:

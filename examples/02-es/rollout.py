@@ -1,7 +1,6 @@
-"""What a worker of the pool does: it sets itself up once, then evaluates candidates.
+"""Work of the pool's workers: set up once, then evaluate candidates.
 
-These functions live in a module of their own, not in the main script, so that all that travels
-of them is their name.
+These functions have a separate module, so that only their names travel.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from policy import Policy, Vector, make_env, play, play_randomly
 
 
 class Worker:
-    """What one worker keeps between tasks."""
+    """State that one worker keeps between tasks."""
 
     def __init__(self, env_name: str, table: NoiseTable) -> None:
         self.env: gym.Env[Any, Any] = make_env(env_name)
@@ -23,7 +22,7 @@ class Worker:
         self.noise = table.open()
 
     def play(self, theta: Vector, seed: int) -> float:
-        """The return of the policy `theta` in the episode `seed`."""
+        """Return the return of the policy `theta` in the episode `seed`."""
         return play(self.env, self.policy.act(theta), seed)
 
 
@@ -31,23 +30,23 @@ worker: Worker
 
 
 def prepare(env_name: str, table: NoiseTable) -> None:
-    """The pool's initializer."""
+    """Set up a worker: the pool's initializer."""
     global worker
     worker = Worker(env_name, table)
 
 
 def evaluate(theta: Vector, sigma: float, candidate: Candidate) -> tuple[int, tuple[float, float]]:
-    """Play both halves of a pair; answer with the noise index and the two returns."""
+    """Play both halves of a pair; return the noise index and the two returns."""
     index, seed = candidate
     step = sigma * worker.noise[index : index + theta.size]
     return index, (worker.play(theta + step, seed), worker.play(theta - step, seed))
 
 
 def test(theta: Vector, seed: int) -> float:
-    """The return of the policy itself, without noise."""
+    """Return the return of the policy itself, without noise."""
     return worker.play(theta, seed)
 
 
 def baseline(seed: int) -> float:
-    """The return of random actions."""
+    """Return the return of random actions."""
     return play_randomly(worker.env, seed)

@@ -33,7 +33,7 @@ def main() -> None:
 def run(
     envs: VectorEnv[Any, Any, Any], options: argparse.Namespace
 ) -> tuple[float, npt.NDArray[Any]]:
-    """Steps a second with random actions, and the observations that they led to."""
+    """Return steps a second with random actions, and the observations that they led to."""
     envs.action_space.seed(0)
     envs.reset(seed=0)
     try:

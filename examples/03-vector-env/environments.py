@@ -1,4 +1,4 @@
-"""The environments that both programs step, and the clock that times them."""
+"""Environments that both programs step, and the clock that times them."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ MakeEnv = Callable[[], gym.Env[Any, Any]]
 
 
 class Simulator(gym.Wrapper[Any, Any, Any, Any]):
-    """Makes a step take so many milliseconds of a core, as that of a real simulator does."""
+    """Environment whose step takes so many milliseconds of a core, as in a real simulator."""
 
     def __init__(self, env: gym.Env[Any, Any], milliseconds: float) -> None:
         super().__init__(env)
         self._seconds = milliseconds / 1000
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        # The time of this thread on a core, not the clock on the wall: two environments that
-        # share a core must not count the same moment twice.
+        # The time of this thread on a core, not the clock on the wall: two environments that share
+        # a core must not count the same moment twice.
         end = time.thread_time() + self._seconds
         result = self.env.step(action)
         while time.thread_time() < end:
@@ -31,18 +31,18 @@ class Simulator(gym.Wrapper[Any, Any, Any, Any]):
 
 
 def make(name: str, milliseconds: float) -> gym.Env[Any, Any]:
-    """One environment, slowed down to `milliseconds` a step if it is faster than that."""
+    """Make one environment, slowed down to `milliseconds` a step if it is faster."""
     env: gym.Env[Any, Any] = gym.make(name)
     return Simulator(env, milliseconds) if milliseconds else env
 
 
 def makers(options: argparse.Namespace, milliseconds: float) -> list[MakeEnv]:
-    """A function for each environment that makes it, in whatever process calls it."""
+    """Return a function for each environment that makes it, in any process."""
     return [partial(make, options.env, milliseconds)] * options.envs
 
 
 def rate(step: Callable[[], object], options: argparse.Namespace) -> float:
-    """Environment steps a second, when `step` steps all of the environments once."""
+    """Return environment steps a second, when `step` steps all of the environments once."""
     steps: int = options.steps
     envs: int = options.envs
     started = time.perf_counter()
@@ -52,7 +52,7 @@ def rate(step: Callable[[], object], options: argparse.Namespace) -> float:
 
 
 def parse(description: str, arguments: Sequence[str] | None = None) -> argparse.Namespace:
-    """The options that both programs have."""
+    """Return the options that both programs have."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--env", default="CartPole-v1")
     parser.add_argument("--envs", type=int, default=8, help="how many environments")

@@ -1,7 +1,7 @@
-"""A vector environment from Process and Pipe, as in the PPO of OpenAI Baselines and the paper.
+"""Vector environment from Process and Pipe, as in the PPO of OpenAI Baselines and the paper.
 
-Each environment has a process of its own and keeps its state there. The parent sends actions down
-the pipes and collects what the environments answer, in the same order.
+Each environment has its own process and keeps its state there. The parent sends actions down the
+pipes and collects the environments' answers, in the same order.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ Array = npt.NDArray[Any]
 
 
 def serve(connection: Any, parents_end: Any, make_env: MakeEnv) -> None:
-    """The child: one environment, driven by what comes through `connection`."""
-    # Or there would be no end of file when the parent goes: this copy would hold the pipe open.
+    """Run the child: one environment, driven by the messages of `connection`."""
+    # This copy would hold the pipe open, and the parent's end would never be seen.
     parents_end.close()
     env = make_env()
     try:
@@ -37,14 +37,14 @@ def serve(connection: Any, parents_end: Any, make_env: MakeEnv) -> None:
             elif command == "close":
                 break
     except EOFError:
-        pass  # the parent is gone, and with it the reason to go on
+        pass  # the parent has ended
     finally:
         env.close()
         connection.close()
 
 
 class VecEnv:
-    """Steps many environments at once, each in its own process.
+    """Vector that steps many environments at once, each in its own process.
 
     An environment that ends is reset at once: its next observation is the first of a new episode.
     """
@@ -55,19 +55,19 @@ class VecEnv:
         self._processes = []
         for (parents_end, childs_end), make_env in zip(pipes, make_functions, strict=True):
             process = fiber.Process(target=serve, args=(childs_end, parents_end, make_env))
-            process.daemon = True  # goes with the parent, however that ends
+            process.daemon = True  # ends with the parent, however that ends
             process.start()
             childs_end.close()
             self._processes.append(process)
 
     def reset(self, seed: int) -> Array:
-        """First observations; environment i starts from `seed` + i."""
+        """Return first observations; environment i starts from `seed` + i."""
         for offset, pipe in enumerate(self._pipes):
             pipe.send(("reset", seed + offset))
         return np.stack([pipe.recv() for pipe in self._pipes])
 
     def step(self, actions: Sequence[Any] | Array) -> tuple[Array, Array, Array]:
-        """Observations, rewards and which episodes ended, after one action for each."""
+        """Return observations, rewards and which episodes ended, after one action for each."""
         for pipe, action in zip(self._pipes, actions, strict=True):
             pipe.send(("step", action))
         observations, rewards, over = zip(*[pipe.recv() for pipe in self._pipes], strict=True)
@@ -79,7 +79,7 @@ class VecEnv:
             try:
                 pipe.send(("close", None))
             except OSError:
-                pass  # this one is gone already, which is what was to be said
+                pass  # this one has ended already
             pipe.close()
         for process in self._processes:
             process.join()
@@ -116,7 +116,7 @@ def main() -> None:
 
 
 class Returns:
-    """Adds up the rewards of each environment's episodes."""
+    """Sums of the rewards of each environment's episodes."""
 
     def __init__(self, envs: int) -> None:
         self._running = np.zeros(envs)
@@ -130,7 +130,7 @@ class Returns:
 
     @property
     def mean(self) -> float:
-        """The mean return of the episodes that ended; nan if none did."""
+        """Return the mean return of the episodes that ended; nan if none did."""
         return sum(self.finished) / len(self.finished) if self.finished else float("nan")
 
 

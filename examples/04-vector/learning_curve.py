@@ -1,4 +1,4 @@
-"""The learning curve as a picture."""
+"""Picture of the learning curve."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ WINDOW = 50  # episodes in a mean
 
 
 class Ended(NamedTuple):
-    """An episode, after how many steps of training it ended, and its return."""
+    """End of an episode: after how many steps of training, and its return."""
 
     steps: int
     value: float
@@ -21,7 +21,7 @@ class Ended(NamedTuple):
 
 def write_curve(path: Path, title: str, ended: Sequence[Ended]) -> None:
     """Write a picture to `path`: the return of each episode, and their moving mean."""
-    # Imported here: the workers need none of it. A Figure of its own draws without a display.
+    # Imported here, because the workers do not need it. A separate Figure draws without a display.
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8.6, 4.3), dpi=150, layout="constrained")

@@ -1,4 +1,4 @@
-"""A small neural network, its gradient, and Adam: NumPy alone."""
+"""Small neural network, its gradient, and Adam: NumPy alone."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ class Network:
 
     @property
     def size(self) -> int:
-        """How many parameters there are."""
+        """Number of parameters."""
         return sum(each.size for each in self._parameters)
 
     def __call__(self, batch: Array) -> Array:
-        """The outputs for a batch of inputs, which `train` remembers."""
+        """Return the outputs for a batch of inputs, which `train` remembers."""
         self._inputs = []
         for layer in range(0, len(self._parameters), 2):
             if layer:
@@ -42,12 +42,12 @@ class Network:
         return batch
 
     def train(self, gradient: Array, rate: float, largest: float = 0.5) -> None:
-        """A step down the gradient of a loss by the outputs of the last call."""
+        """Take a step down the gradient of a loss by the outputs of the last call."""
         gradients: list[Array] = []
         for index in reversed(range(len(self._inputs))):
             inputs = self._inputs[index]
             gradients[:0] = [inputs.T @ gradient, gradient.sum(axis=0)]
-            # Of all inputs but the first: what came out of a tanh.
+            # Only for inputs of later layers, which came out of a tanh.
             gradient = gradient @ self._parameters[2 * index].T * (1 - inputs**2)
         length = np.sqrt(sum(float((each**2).sum()) for each in gradients))
         scale = min(1.0, largest / (length + 1e-8))

@@ -13,7 +13,7 @@ EPOCHS, MINIBATCH = 10, 256
 
 
 class Experience(NamedTuple):
-    """What a rollout gave: by step, then by environment."""
+    """Data of a rollout: by step, then by environment."""
 
     observations: Array
     actions: Any
@@ -21,15 +21,15 @@ class Experience(NamedTuple):
     values: Array
     rewards: Array
     over: Any
-    """Whether the episode ended with this step."""
+    """True where the episode ended with this step."""
     cut_short: Array
-    """Where it ended only as time was up: what the state is worth that it ended in; else 0."""
+    """Value of the last state of an episode that only ran out of time; else 0."""
     last_values: Array
-    """What the state was worth that the last step led to."""
+    """Value of the state that the last step led to."""
 
 
 class Learner:
-    """A policy, what it thinks that states are worth, and how both learn."""
+    """Policy, estimates of the value of states, and how both learn."""
 
     def __init__(self, inputs: int, actions: int, rng: np.random.Generator) -> None:
         self._rng = rng
@@ -38,24 +38,23 @@ class Learner:
 
     @property
     def size(self) -> int:
-        """How many parameters there are."""
+        """Number of parameters."""
         return self._policy.size + self._critic.size
 
     def act(self, observations: Array) -> tuple[Any, Array, Array]:
-        """An action for each observation, how likely it was (a logarithm), and what the state is
-        worth.
-        """
+        """Return an action for each observation, its likelihood (a logarithm), and the state's
+        value."""
         logs = _log_softmax(self._policy(observations))
         # The largest of logarithm and noise: a draw from the distribution (Gumbel).
         actions = np.argmax(logs + self._rng.gumbel(size=logs.shape), axis=1)
         return actions, logs[np.arange(len(logs)), actions], self.values(observations)
 
     def values(self, observations: Array) -> Array:
-        """What states are worth."""
+        """Return the values of states."""
         return self._critic(observations)[:, 0]
 
     def learn(self, experience: Experience, share_left: float) -> None:
-        """Improve by what was experienced, the less the less training is left."""
+        """Improve by this experience, the less the less training is left."""
         advantages = _advantages(experience)
         targets = (advantages + experience.values).ravel()
         observations = experience.observations.reshape(targets.size, -1)
@@ -88,7 +87,7 @@ class Learner:
 
 
 def _advantages(experience: Experience) -> Array:
-    """How much better each action was than the state let expect (generalized estimation)."""
+    """Return how much better each action was than expected (generalized advantage estimation)."""
     advantages = np.zeros_like(experience.rewards)
     following, next_values = np.zeros_like(experience.last_values), experience.last_values
     for step in reversed(range(len(advantages))):

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-# Of matrices as small as these, threads only wait for each other. NumPy reads it when imported.
+# With matrices as small as these, threads only wait for each other. NumPy reads this when imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import gymnasium as gym
@@ -26,7 +26,7 @@ import fiber
 from fiber.vector import VectorEnv, make_vec
 
 HORIZON = 64  # steps of each environment between two improvements
-RECENT = 50  # episodes whose mean return is told
+RECENT = 50  # episodes in the mean return that is printed
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -64,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def train(
     envs: VectorEnv, learner: Learner, options: argparse.Namespace, ended: list[Ended]
 ) -> None:
-    """Take turns in rolling out and learning; adds episodes to `ended` as they end."""
+    """Roll out and learn in turn; add episodes to `ended` as they end."""
     rounds = max(1, options.steps // (HORIZON * options.envs))
     observations, _ = envs.reset(seed=options.seed)
     returns = np.zeros(options.envs)
@@ -85,7 +85,7 @@ def train(
 
 
 def roll_out(envs: VectorEnv, learner: Learner, observations: Any) -> tuple[Experience, Any]:
-    """Let the policy act for a while; what it experienced, and where it is then."""
+    """Let the policy act for a while; return the rollout, and the last observations."""
     taken: list[tuple[Any, ...]] = []
     for _ in range(HORIZON):
         before = observations.astype(np.float64)
@@ -103,7 +103,7 @@ def roll_out(envs: VectorEnv, learner: Learner, observations: Any) -> tuple[Expe
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """The options; what is wrong with them is said before anything starts."""
+    """Return the options; report wrong ones before anything starts."""
     parser = argparse.ArgumentParser(description="PPO in NumPy with fiber.vector.")
     parser.add_argument("--env", default="CartPole-v1", help="flat observations, few actions")
     parser.add_argument("--envs", type=int, default=16, help="how many environments")

@@ -1,4 +1,4 @@
-"""What the searches have seen, as a picture."""
+"""Picture of the scores that the searches have seen."""
 
 from __future__ import annotations
 

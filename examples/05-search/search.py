@@ -19,11 +19,11 @@ from sklearn.svm import SVC
 import fiber.joblib  # registers the backend "fiber"
 
 C, GAMMA = (0.1, 1000.0), (1e-5, 1e-1)
-"""The range of each parameter."""
+"""Range of each parameter."""
 
 
 class Best(NamedTuple):
-    """The best that a search has found."""
+    """Best parameters that a search has found."""
 
     score: float
     c: float
@@ -36,7 +36,7 @@ class Best(NamedTuple):
 def search_grid(
     executor: fiber.Executor, images: Any, digits: Any, points: int
 ) -> tuple[Best, GridSearchCV]:
-    """All combinations of so many values of each parameter, by scikit-learn."""
+    """Search all combinations of so many values of each parameter, by scikit-learn."""
     values = {"C": np.geomspace(*C, points), "gamma": np.geomspace(*GAMMA, points)}
     grid = GridSearchCV(SVC(), values, cv=3)
     with joblib.parallel_config(backend="fiber", executor=executor, n_jobs=-1):
@@ -47,7 +47,7 @@ def search_grid(
 def search_by_study(
     executor: fiber.Executor, images: Any, digits: Any, trials: int, workers: int
 ) -> tuple[Best, optuna.Study]:
-    """So many trials, each where those before it promise the most; all workers have one."""
+    """Try so many trials where earlier ones promise the most; all workers always have one."""
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     sampler = optuna.samplers.TPESampler(seed=0, constant_liar=True)
     study = optuna.create_study(direction="maximize", sampler=sampler)
@@ -67,7 +67,7 @@ def search_by_study(
 
 
 def evaluate(images: Any, digits: Any, parameters: dict[str, float]) -> float:
-    """The share of digits that are recognized, by cross-validation."""
+    """Return the share of digits that are recognized, by cross-validation."""
     return float(np.mean(cross_val_score(SVC(**parameters), images, digits, cv=3)))
 
 
@@ -100,7 +100,7 @@ def main() -> None:
     parser.add_argument("--samples", type=_number, default=1000, help="images of digits to use")
     parser.add_argument("--points", type=_number, default=7, help="of each parameter in the grid")
     parser.add_argument("--trials", type=_number, default=40, help="of the study")
-    parser.add_argument("--picture", type=Path, help="where to draw what was found")
+    parser.add_argument("--picture", type=Path, help="file for a picture of the scores")
     options = parser.parse_args()
     images, digits = (each[: options.samples] for each in load_digits(return_X_y=True))
     with fiber.Executor(options.workers) as executor:

@@ -1,6 +1,6 @@
-"""The learner: a policy and a value function, both linear in a few features, in NumPy.
+"""Learner: a policy and a value function, both linear in a few features, in NumPy.
 
-It knows no processes: it gets observations and gives actions, and learns from what came of them.
+It knows no processes: it gets observations, gives actions, and learns from the outcome.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ import numpy.typing as npt
 Array = npt.NDArray[Any]
 
 GAMMA = 0.98
-"""How much a reward counts one step earlier."""
+"""Weight of a reward one step earlier."""
 POLICY_RATE, VALUE_RATE = 0.2, 0.1
 
 
 class ActorCritic:
-    """Actions for many environments at once, from what it has learned so far."""
+    """Actor for many environments at once, which learns from experience."""
 
     def __init__(self, observation_size: int, actions: int, seed: int) -> None:
         self._rng = np.random.default_rng(seed)
@@ -27,7 +27,7 @@ class ActorCritic:
         self._updates = 0
 
     def act(self, observations: Array) -> Array:
-        """An action for each observation, drawn from the policy."""
+        """Return an action for each observation, drawn from the policy."""
         below = np.cumsum(self._probabilities(_features(observations)), axis=1)
         drawn = self._rng.random((len(below), 1))
         chosen: Array = (drawn > below[:, :-1]).sum(axis=1)
@@ -64,6 +64,6 @@ class ActorCritic:
 
 
 def _features(observations: Array) -> Array:
-    """The numbers of an observation, their squares, and one."""
+    """Return the numbers of an observation, their squares, and one."""
     ones = np.ones((*observations.shape[:-1], 1))
     return np.concatenate([observations, observations**2, ones], axis=-1)

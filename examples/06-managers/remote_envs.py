@@ -1,4 +1,4 @@
-"""Environments as managed objects, each in a process of its own: on a cluster, in a pod."""
+"""Environments as managed objects, each in a separate process: on a cluster, in a pod."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ Array = npt.NDArray[Any]
 
 
 class Env:
-    """A Gymnasium environment that begins a new episode when one ends.
+    """Gymnasium environment that begins a new episode when one ends.
 
-    A step takes ``milliseconds`` at least, as that of a game or a robot that runs in real time.
+    A step takes ``milliseconds`` at least, as in a game or a robot that runs in real time.
     """
 
     def __init__(self, name: str, milliseconds: float) -> None:
@@ -29,12 +29,12 @@ class Env:
         self._seconds = milliseconds / 1000
 
     def reset(self, seed: int) -> Array:
-        """The first observation."""
+        """Return the first observation."""
         observation: Array = self._env.reset(seed=seed)[0]
         return observation
 
     def step(self, action: int) -> tuple[Array, float, bool]:
-        """Observation, reward, and whether an episode has ended."""
+        """Return observation, reward, and whether an episode has ended."""
         end = time.perf_counter() + self._seconds
         observation, reward, terminated, truncated, _ = self._env.step(action)
         if terminated or truncated:
@@ -44,11 +44,12 @@ class Env:
 
 
 class EnvManager(fiber.BaseManager):
-    """Its environments are stepped one after the other: a call returns what came of it."""
+    """Manager whose environments are stepped one after the other: a call returns the result."""
 
 
 class AsyncEnvManager(AsyncManager):
-    """Its environments are stepped side by side: a call returns a handle for what will come."""
+    """Manager whose environments are stepped side by side: a call returns a result object at
+    once."""
 
 
 for manager in (EnvManager, AsyncEnvManager):
@@ -56,7 +57,7 @@ for manager in (EnvManager, AsyncEnvManager):
 
 
 class RemoteEnvs:
-    """Some environments, each in the process of a manager of its own."""
+    """Set of environments, each in the process of its manager."""
 
     def __init__(self, name: str, envs: int, milliseconds: float, *, side_by_side: bool) -> None:
         kind: Any = AsyncEnvManager if side_by_side else EnvManager
@@ -67,12 +68,12 @@ class RemoteEnvs:
         self._envs = [manager.Env(name, milliseconds) for manager in self._managers]
 
     def reset(self, seed: int) -> Array:
-        """First observations; environment i starts from ``seed`` + i."""
+        """Return first observations; environment i starts from ``seed`` + i."""
         begun = [env.reset(seed + place) for place, env in enumerate(self._envs)]
         return np.stack(self._results(begun))
 
     def step(self, actions: Sequence[int] | Array) -> tuple[Array, Array, Array]:
-        """Observations, rewards and which episodes ended, after one action for each."""
+        """Return observations, rewards and which episodes ended, after one action for each."""
         begun = [env.step(int(action)) for env, action in zip(self._envs, actions, strict=True)]
         observations, rewards, over = zip(*self._results(begun), strict=True)
         return np.stack(observations), np.array(rewards), np.array(over)

@@ -1,7 +1,7 @@
 """Train a policy on environments that are managed objects: the paper's third listing.
 
-Each environment has a process of its own, which on a cluster is a pod. The learner steps all of
-them side by side and learns from what comes back.
+Each environment has its own process, which on a cluster is a pod. The learner steps all of them
+side by side and learns from the results.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ LATELY = 20
 
 
 class Training(NamedTuple):
-    """What came of it."""
+    """Outcome of a training."""
 
     ended: list[tuple[int, float]]
-    """Of each episode that ended: after how many steps of all environments, and its return."""
+    """Episodes that ended: after how many steps of all environments, and their returns."""
     rate: float
     """Steps of all environments a second."""
 
@@ -59,7 +59,7 @@ def train(envs: RemoteEnvs, model: ActorCritic, options: argparse.Namespace) -> 
 
 
 def rate_one_after_the_other(options: argparse.Namespace) -> float:
-    """Steps a second of the same environments without AsyncManager."""
+    """Return steps a second of the same environments without AsyncManager."""
     with RemoteEnvs(options.env, options.envs, options.ms, side_by_side=False) as envs:
         envs.reset(options.seed)
         started = time.perf_counter()
@@ -70,8 +70,8 @@ def rate_one_after_the_other(options: argparse.Namespace) -> float:
 
 
 def draw(path: Path, training: Training, alone: float, options: argparse.Namespace) -> None:
-    """The returns of the episodes, and the steps a second either way."""
-    # Imported here: the environments' processes need none of it. It draws without a display.
+    """Draw the returns of the episodes, and the steps a second with either manager."""
+    # Imported here, because the environments' processes do not need it. It draws without a display.
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8.6, 3.8), dpi=150, layout="constrained")

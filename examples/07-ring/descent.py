@@ -1,4 +1,4 @@
-"""How the error falls, as a picture."""
+"""Picture of the error as it falls."""
 
 from __future__ import annotations
 

@@ -18,11 +18,12 @@ from fiber.ring import Member
 
 FEATURES = 2000
 Sum = Callable[[Any], Any]
-"""Adds up an array of all members."""
+"""Function that sums an array over all members."""
 
 
 def data(rank: int, size: int, samples: int) -> tuple[Any, Any]:
-    """What member `rank` has of a regression problem: inputs, and outputs with a little noise."""
+    """Return member `rank`'s part of a regression problem: inputs, and outputs with a little
+    noise."""
     truth = np.random.default_rng(0).normal(size=FEATURES)
     inputs = np.random.default_rng(1).normal(size=(samples, FEATURES))[rank::size]
     noise = np.random.default_rng(2).normal(size=samples)[rank::size]
@@ -30,7 +31,7 @@ def data(rank: int, size: int, samples: int) -> tuple[Any, Any]:
 
 
 def train(samples: int, steps: int, by_gloo: bool, rank: int, size: int) -> list[float]:
-    """The mean squared error before each step; the same in all members."""
+    """Return the mean squared error before each step; the same in all members."""
     inputs, outputs = data(rank, size, samples)
     add_up: Sum = with_gloo if by_gloo else partial(all_reduce, fiber.ring.current())
     weights = np.zeros(FEATURES)
@@ -44,7 +45,7 @@ def train(samples: int, steps: int, by_gloo: bool, rank: int, size: int) -> list
 
 
 def start_gloo(member: Member) -> None:
-    """Meet the others in torch.distributed: all hear from rank 0, by the ring, where that is."""
+    """Meet the others in torch.distributed, at an address that rank 0 tells all round the ring."""
     import torch.distributed as distributed
 
     where = member.recv() if member.rank else _free_address()
@@ -54,7 +55,7 @@ def start_gloo(member: Member) -> None:
 
 
 def with_gloo(array: Any) -> Any:
-    """The sum of all members' arrays, by torch.distributed."""
+    """Return the sum of all members' arrays, by torch.distributed."""
     import torch
     import torch.distributed as distributed
 
@@ -83,8 +84,10 @@ def main() -> None:
     parser.add_argument("--members", type=_number, default=4)
     parser.add_argument("--samples", type=_number, default=8000)
     parser.add_argument("--steps", type=_number, default=40)
-    parser.add_argument("--gloo", action="store_true", help="by torch.distributed, not by pipes")
-    parser.add_argument("--picture", type=Path, help="where to draw how the error falls")
+    parser.add_argument(
+        "--gloo", action="store_true", help="sum by torch.distributed, not by pipes"
+    )
+    parser.add_argument("--picture", type=Path, help="file for a picture of the error")
     options = parser.parse_args()
     if options.gloo and importlib.util.find_spec("torch") is None:
         parser.error("--gloo needs torch: pip install torch")
@@ -93,7 +96,7 @@ def main() -> None:
     errors = ring.run()
     print(f"error before: {errors[0][0]:.4g}, after {options.steps} steps: {errors[0][-1]:.4g}")
     same = all(each == errors[0] for each in errors)
-    print(f"{options.members} members went the {'same way' if same else 'ways of their own'}")
+    print(f"{options.members} members went the {'same way' if same else 'different ways'}")
     if options.picture:
         from descent import draw
 
