@@ -18,9 +18,9 @@ from typing import Any
 from benchmarks.fake_agents import FakeAgent, TaskRunner
 
 from fiber._agent.service import AgentService
+from fiber._transport.authentication import Identity
 from fiber._transport.credentials import Credentials
 from fiber._transport.dialer import AgentDialer
-from fiber._transport.handshake import Identity
 from fiber._transport.link import Link
 from fiber._transport.loop import Loop
 

@@ -12,13 +12,13 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from fiber._transport.handshake import Identity
-from fiber._transport.link import DEFAULT_KEEPALIVE, Keepalive, ResumableLink
-from fiber._transport.stream import Datagram
+from fiber._transport.authentication import Identity
+from fiber._transport.link import DEFAULT_KEEPALIVE, Keepalive, Link
+from fiber._transport.link_protocol import Datagram
 
 
 class SimulatedTimer:
-    """A call that is due; a ``Timer``."""
+    """A call that is due; a ``ScheduledCall``."""
 
     __slots__ = ("callback",)
 
@@ -103,11 +103,9 @@ class Cable:
         self.is_cut = False
         self._redial_after = redial_after
         self._wires: tuple[MemoryWire, ...] = ()
-        self._ended: set[ResumableLink] = set()
+        self._ended: set[Link] = set()
         self.agent, self.master = (
-            ResumableLink(
-                loop, Identity.of_this_process(peer), keepalive, self._ended.add, dials=dials
-            )
+            Link(loop, Identity.of_this_process(peer), keepalive, self._ended.add, dials=dials)
             for peer, dials in (("the master", True), ("agent", False))
         )
         self._connect()
@@ -144,9 +142,9 @@ class Cable:
 
 
 class MemoryWire:
-    """One end of one connection; a ``Wire``."""
+    """One end of one connection; a ``LinkConnection``."""
 
-    def __init__(self, cable: Cable, link: ResumableLink) -> None:
+    def __init__(self, cable: Cable, link: Link) -> None:
         self.other: MemoryWire | None = None
         self._cable = cable
         self._link = link

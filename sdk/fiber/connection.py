@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING, Any, Generic, Self, TypeAlias, overload
 
 from fiber import reduction
 from fiber._hub import handles, one_way
-from fiber._transport.base import Channel
-from fiber._transport.unix import UnixChannel
+from fiber._transport.channels import Channel, UnixChannel
 from fiber._wire import packet
 from fiber._wire.memory_files import BytesLike
 from fiber._wire.packet import Message

@@ -30,7 +30,7 @@ from fiber._hub import one_way
 from fiber._hub.dealer import Dealer, arrive
 from fiber._hub.feeder import Feeder, ItemCount, Slots
 from fiber._hub.local import LocalChannel, LocalCounter
-from fiber._transport.base import SharedCounter
+from fiber._transport.channels import SharedCounter
 from fiber._wire import packet
 from fiber._wire.packet import Message
 from fiber.connection import Connection

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from fiber._hub import client
 from fiber._hub.directory import forget_memory, note_memory
 from fiber._runtime.state import runtime
-from fiber._transport.unix import naming_the_limit
+from fiber._transport.channels import naming_the_limit
 
 __all__ = ["ShareableList", "SharedMemory"]
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from fiber._hub.shared_semaphores import AnySemaphore
     from fiber._hub.wait_lists import AnyWaitList
-    from fiber._transport.base import SharedCounter
+    from fiber._transport.channels import SharedCounter
 
 __all__ = [
     "SEM_VALUE_MAX",

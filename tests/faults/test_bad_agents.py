@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from faults.program import Program
-from fiber._transport import handshake
+from fiber._transport import authentication
 from fiber._transport.credentials import make_credentials
 from fiber._wire import messages
 from patience import PATIENCE
@@ -90,11 +90,11 @@ def test_wrong_credentials(master: Callable[..., tuple[Program, Program]], tmp_p
     [
         (
             "import platform; platform.python_version = lambda: '2.7.18'",
-            handshake.Identity.of_this_process("x").python,
+            authentication.Identity.of_this_process("x").python,
             "2.7.18",
         ),
         (
-            "import fiber._transport.handshake as h; h.PROTOCOL = 999",
+            "import fiber._transport.authentication as h; h.PROTOCOL = 999",
             str(messages.PROTOCOL),
             "999",
         ),

@@ -13,9 +13,9 @@ import pytest
 from faults.program import Program
 from fiber._transport.credentials import MasterCredentials, make_credentials
 from fiber._transport.link import Link
+from fiber._transport.link_protocol import Frame
 from fiber._transport.listener import MasterListener
 from fiber._transport.loop import Loop
-from fiber._transport.stream import Frame
 from patience import PATIENCE
 
 COUNT = 1024
@@ -26,7 +26,7 @@ AGENTS = """
     import os, sys
     import pickle
     from fiber._transport.dialer import AgentDialer
-    from fiber._transport.handshake import Identity
+    from fiber._transport.authentication import Identity
     from fiber._transport.loop import Loop
 
     class Echo:

@@ -21,9 +21,9 @@ from faults import targets
 from faults.program import LOOPBACK, Program, wait_for
 from faults.runtime import running
 from fiber._backends.loopback import LoopbackBackend
-from fiber._transport import tls
+from fiber._transport import authentication
+from fiber._transport.authentication import AgentHello, Identity
 from fiber._transport.credentials import make_credentials
-from fiber._transport.handshake import Hello, Identity
 from patience import PATIENCE
 from unit.link_site import say
 
@@ -151,7 +151,7 @@ def test_nonsense_over_tls_is_not_unpickled(
     trace = tmp_path / "unpickled"
     made = backend._credentials if pool == "this one" else make_credentials()
     credentials = replace(made.agent("loopback-0", "uid"), master="")
-    with pytest.raises(tls.HungUp):
+    with pytest.raises(authentication.HungUp):
         say(backend._listener.address, credentials, pickle.dumps(Bomb(trace)))
     works()
     assert not trace.exists()
@@ -159,9 +159,9 @@ def test_nonsense_over_tls_is_not_unpickled(
 
 def test_a_stranger_who_claims_to_be_an_agent_is_not_believed(backend: LoopbackBackend) -> None:
     slot = backend._slots[0]
-    hello = Hello(Identity.of_this_process(slot.name, slot.uid), "0" * 32, 0, False)
+    hello = AgentHello(Identity.of_this_process(slot.name, slot.uid), "0" * 32, 0, False)
     forged = replace(make_credentials().agent(slot.name, slot.uid), master="")
-    with pytest.raises(tls.Untrusted, match="does not believe"):
+    with pytest.raises(authentication.Untrusted, match="does not believe"):
         say(backend._listener.address, forged, hello.encode())
     works()
 

@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import pytest
 
-from fiber._transport.link import Keepalive, ResumableLink
-from fiber._transport.stream import Frame
+from fiber._transport.link import Keepalive, Link
+from fiber._transport.link_protocol import Frame
 from memory_link import Cable, SimulatedLoop
 
 KEEPALIVE = Keepalive()
@@ -22,7 +22,7 @@ TICK = KEEPALIVE.heartbeat / 3 + 0.05
 class Judge:
     """Hears what one end of a link tells, and knows when that end truly heard of the other."""
 
-    def __init__(self, loop: SimulatedLoop, link: ResumableLink) -> None:
+    def __init__(self, loop: SimulatedLoop, link: Link) -> None:
         self.frames: list[bytes] = []
         self.suspect = False
         self.lost: str | None = None

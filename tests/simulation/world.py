@@ -11,7 +11,7 @@ from functools import partial
 from typing import Any, Protocol
 
 from fiber._agent.interface import ChildObserver
-from fiber._transport.loop import Timer
+from fiber._transport.loop import LoopTimer
 from memory_link import SimulatedLoop
 from simulation import schedule
 from simulation.agents import LOST_AFTER, Agent, Child
@@ -115,7 +115,7 @@ class Loop(SimulatedLoop):
 
     def call_later(self, seconds: float, callback: Callable[..., object], *args: Any) -> Any:
         """Call it once, ``seconds`` from now."""
-        timer: Any = Timer(self._now + seconds, partial(callback, *args))
+        timer: Any = LoopTimer(self._now + seconds, partial(callback, *args))
         heapq.heappush(self._timers, (timer.due, next(self._sequence), timer))
         return timer
 

@@ -11,7 +11,7 @@ from typing import Any, NoReturn
 from fiber._agent import child
 from fiber._agent.interface import ExitReport
 from fiber._transport.link import LinkObserver
-from fiber._transport.stream import Lane
+from fiber._transport.link_protocol import Lane
 from fiber._wire import messages, packet
 from fiber._wire.memory_files import BytesLike
 from patience import PATIENCE

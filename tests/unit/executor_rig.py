@@ -16,7 +16,7 @@ from fiber._runtime.executor import PoolExecutor
 from fiber._runtime.options import PoolOptions
 from fiber._runtime.work_items import WorkItem
 from fiber._runtime.workers import WorkerHandle
-from fiber._transport.loop import Timer
+from fiber._transport.loop import LoopTimer
 from fiber._wire import work
 from fiber._wire.packet import Message
 from fiber.process import PoolProcess, Process
@@ -32,7 +32,7 @@ class ManualLoop:
     def __init__(self) -> None:
         self.held = False
         self._time = 0.0
-        self._timers: list[Timer] = []
+        self._timers: list[LoopTimer] = []
         self._ready: deque[tuple[Callable[..., object], tuple[Any, ...]]] = deque()
         self._running = False
 
@@ -54,13 +54,13 @@ class ManualLoop:
         self.held = False
         self._run()
 
-    def call_later(self, seconds: float, callback: Callable[..., object], *args: Any) -> Timer:
-        timer = Timer(self._time + seconds, lambda: callback(*args))
+    def call_later(self, seconds: float, callback: Callable[..., object], *args: Any) -> LoopTimer:
+        timer = LoopTimer(self._time + seconds, lambda: callback(*args))
         self._timers.append(timer)
         return timer
 
     @property
-    def timers(self) -> list[Timer]:
+    def timers(self) -> list[LoopTimer]:
         """Those that are to fire."""
         return [timer for timer in self._timers if timer.callback is not None]
 

@@ -12,15 +12,15 @@ from typing import Any, TypeVar
 
 import pynng
 
-from fiber._transport import tls
+from fiber._transport import authentication
 from fiber._transport.acceptor import Acceptor
+from fiber._transport.authentication import Identity
 from fiber._transport.credentials import Credentials, MasterCredentials
 from fiber._transport.dialer import AgentDialer
-from fiber._transport.handshake import Identity
 from fiber._transport.link import Keepalive, Link
+from fiber._transport.link_protocol import Frame
 from fiber._transport.listener import MasterListener
 from fiber._transport.loop import Loop
-from fiber._transport.stream import Frame
 from patience import PATIENCE
 
 # Once used, nng keeps threads and two descriptors for as long as the process lives.  The census of
@@ -194,7 +194,7 @@ def port_of(address: str) -> int:
 
 
 def wires_of(listener: MasterListener) -> list[Any]:
-    return [link._wire for link in listener._links.values() if link._wire is not None]
+    return [link._connection for link in listener._links.values() if link._connection is not None]
 
 
 def break_connections(listener: MasterListener) -> None:
@@ -212,14 +212,14 @@ def vanish(listener: MasterListener) -> None:
 def say(address: str, credentials: Credentials, words: bytes) -> bytes:
     """What a master answers to the first words of somebody with the right credentials."""
     sock = socket.create_connection(("127.0.0.1", port_of(address)))
-    handshake = tls.AgentHandshake(sock, tls.agent_context())
+    handshake = authentication.AgentHandshake(sock, authentication.agent_context())
     try:
         return complete(handshake, handshake.ask(credentials, words))
     finally:
         handshake.close()
 
 
-def complete(handshake: tls._Handshake, steps: Generator[int, None, T]) -> T:
+def complete(handshake: authentication._Handshake, steps: Generator[int, None, T]) -> T:
     poller = select.poll()
     while True:
         try:

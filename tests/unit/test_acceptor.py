@@ -12,15 +12,15 @@ from typing import Any
 import pytest
 
 from faults.program import wait_for
-from fiber._transport import acceptor, tls
+from fiber._transport import acceptor, authentication
 from fiber._transport.acceptor import Admission
-from fiber._transport.handshake import Hello, Identity
+from fiber._transport.authentication import AgentHello, Identity
 from fiber._transport.listener import MasterListener
 from fiber._transport.loop import Loop
 from patience import PATIENCE
 from unit.link_site import Notes, Site, complete, port_of, say
 
-HELLO = Hello(Identity.of_this_process("stranger"), "0" * 32, 0, False).encode()
+HELLO = AgentHello(Identity.of_this_process("stranger"), "0" * 32, 0, False).encode()
 
 
 @pytest.fixture(autouse=True)
@@ -34,7 +34,7 @@ class Visitor:
     def __init__(self, site: Site, address: str) -> None:
         self._credentials = site.credentials.agent("stranger", "")
         self.sock = socket.create_connection(("127.0.0.1", port_of(address)), PATIENCE)
-        self.handshake = tls.AgentHandshake(self.sock, tls.agent_context())
+        self.handshake = authentication.AgentHandshake(self.sock, authentication.agent_context())
 
     def go(self, state: str) -> None:
         """Up to ``state``, and not a step further."""
@@ -133,7 +133,7 @@ def test_a_greeting_without_end_is_turned_away(site: Site) -> None:
 def test_a_proof_that_is_none_is_told_with_the_name_that_it_claims(site: Site) -> None:
     listener, master = site.listener()
     forged = site.credentials.agent("another", "")
-    with pytest.raises(tls.Untrusted, match="does not believe"):
+    with pytest.raises(authentication.Untrusted, match="does not believe"):
         say(listener.address, forged, HELLO)
     master.wait(lambda: master.refusals)
     assert "it cannot prove that it is 'stranger'" in master.refusals[0]
@@ -229,8 +229,8 @@ def test_one_that_breaks_as_it_is_taken_stays_open_nowhere(site: Site) -> None:
         accepted, _ = server.accept()
     taken = _BreaksAfterTheCheck(fileno=accepted.detach())
     taken.other = other
-    context = tls.master_context(site.credentials.certificate)
-    handshake = tls.MasterHandshake(taken, context, site.credentials.certificate)
+    context = authentication.master_context(site.credentials.certificate)
+    handshake = authentication.MasterHandshake(taken, context, site.credentials.certificate)
     with contextlib.closing(handshake.sock) as secured:
         fd = secured.fileno()
         assert fd >= 0, "whoever goes on with it has it to close"
@@ -255,7 +255,7 @@ def test_closing_hangs_up_on_who_is_under_way(site: Site) -> None:
 def test_nonsense_in_place_of_a_greeting_is_told_once(site: Site) -> None:
     listener, master = site.listener()
     for _ in range(3):
-        with pytest.raises(tls.HungUp):
+        with pytest.raises(authentication.HungUp):
             say(listener.address, site.credentials.agent("a", ""), b"GET / HTTP/1.1")
     master.wait(lambda: master.refusals)
     site.on_loop(lambda: None)
@@ -268,8 +268,8 @@ def test_a_name_that_no_pod_can_have_is_not_repeated(
     site: Site, name: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
     listener, master = site.listener()
-    hello = Hello(Identity.of_this_process(name), "0" * 32, 0, False)
-    with pytest.raises(tls.HungUp):
+    hello = AgentHello(Identity.of_this_process(name), "0" * 32, 0, False)
+    with pytest.raises(authentication.HungUp):
         say(listener.address, site.credentials.agent("a", ""), hello.encode())
     master.wait(lambda: master.refusals)
     assert len(master.refusals[0]) < 500

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from fiber._transport.acceptor import Admission, Verdict
+from fiber._transport.acceptor import Admission, AdmissionDecision
 
-IN, OUT = Verdict(True), Verdict(False)
+IN, OUT = AdmissionDecision(True), AdmissionDecision(False)
 
 
 def test_a_newcomer_beyond_the_bound_for_its_address_waits_its_turn() -> None:
@@ -19,7 +19,7 @@ def test_who_has_had_a_fair_chance_makes_room() -> None:
     door = Admission(total=10, per_address=2)
     door.enter("a", "1.1.1.1", 0.0)
     door.enter("b", "1.1.1.1", 0.5)
-    assert door.enter("c", "1.1.1.1", 1.0) == Verdict(True, "a")
+    assert door.enter("c", "1.1.1.1", 1.0) == AdmissionDecision(True, "a")
     assert door.enter("d", "1.1.1.1", 1.2) == OUT
     assert len(door) == 2
 
@@ -29,8 +29,10 @@ def test_when_all_is_full_the_address_with_the_most_makes_room() -> None:
     door.enter("honest", "2.2.2.2", 0.0)
     door.enter("a", "1.1.1.1", 0.1)
     door.enter("b", "1.1.1.1", 0.2)
-    assert door.enter("c", "3.3.3.3", 5.0) == Verdict(True, "a")
-    assert door.enter("d", "4.4.4.4", 5.0) == Verdict(True, "honest"), "of equals, the oldest"
+    assert door.enter("c", "3.3.3.3", 5.0) == AdmissionDecision(True, "a")
+    assert door.enter("d", "4.4.4.4", 5.0) == AdmissionDecision(True, "honest"), (
+        "of equals, the oldest"
+    )
 
 
 def test_who_leaves_makes_room() -> None:

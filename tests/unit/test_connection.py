@@ -21,8 +21,8 @@ import fiber
 from census import wait_until
 from fiber import connection
 from fiber._agent.interface import ExitReport
-from fiber._transport import unix
-from fiber._transport.unix import UnixChannel
+from fiber._transport import channels
+from fiber._transport.channels import UnixChannel
 from fiber._wire.packet import Message
 from fiber.connection import Connection, Pipe
 from fiber.errors import ConnectionClosed, UnpicklableError
@@ -416,7 +416,7 @@ def looks(monkeypatch: pytest.MonkeyPatch) -> list[float]:
         times.append(clock.now)
         return try_recv(channel)
 
-    monkeypatch.setattr(unix, "time", clock)
+    monkeypatch.setattr(channels, "time", clock)
     monkeypatch.setattr(UnixChannel, "try_recv", look)
     return times
 
@@ -426,7 +426,7 @@ def answer_late(here: Connection, there: Connection, looks: list[float]) -> thre
 
     def answer() -> None:
         assert wait_until(
-            lambda: bool(looks) and looks[-1] > looks[0] + unix._LOOK - 2e-6, PATIENCE
+            lambda: bool(looks) and looks[-1] > looks[0] + channels._LOOK - 2e-6, PATIENCE
         )
         there.send("late")
 
@@ -466,7 +466,7 @@ def test_who_waits_for_an_answer_looks_and_then_sleeps(
     thread = answer_late(here, there, looks)
     assert here.recv() == "late"
     thread.join()
-    assert 10 < len(looks) < 1.1 * unix._LOOK / 1e-6
+    assert 10 < len(looks) < 1.1 * channels._LOOK / 1e-6
     looks.clear()
     for _ in range(255):
         there.send("answer")

@@ -9,7 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fiber._transport.handshake import Hello, Identity, Refusal, Welcome, decode, mismatch
+from fiber._transport.authentication import (
+    AgentHello,
+    Identity,
+    MasterRefusal,
+    MasterWelcome,
+    decode_greeting,
+    version_mismatch,
+)
 from fiber._wire.messages import PROTOCOL, ProtocolError
 
 OURS = Identity("the master", PROTOCOL, "3.11.7", "1.0", {"host": "here"})
@@ -18,18 +25,18 @@ OURS = Identity("the master", PROTOCOL, "3.11.7", "1.0", {"host": "here"})
 @pytest.mark.parametrize(
     "greeting",
     [
-        Hello(OURS, "ab12", 7, True),
-        Welcome(OURS, 0, 0.5, 1.0, 2.0),
-        Refusal(OURS, "no such session"),
+        AgentHello(OURS, "ab12", 7, True),
+        MasterWelcome(OURS, 0, 0.5, 1.0, 2.0),
+        MasterRefusal(OURS, "no such session"),
     ],
 )
-def test_there_and_back(greeting: Hello | Welcome | Refusal) -> None:
-    assert decode(greeting.encode()) == greeting
+def test_there_and_back(greeting: AgentHello | MasterWelcome | MasterRefusal) -> None:
+    assert decode_greeting(greeting.encode()) == greeting
 
 
 def test_a_hello_of_another_protocol_still_says_who_it_is() -> None:
     strange = {"identity": {**vars(OURS), "protocol": 99, "facts": {}}, "ticket": "whatever"}
-    hello = decode(b"\x10" + json.dumps(strange).encode())
+    hello = decode_greeting(b"\x10" + json.dumps(strange).encode())
     assert hello.identity == replace(OURS, protocol=99, facts={})
 
 
@@ -41,25 +48,31 @@ def test_a_hello_of_another_protocol_still_says_who_it_is() -> None:
         (b"\x10", "malformed"),
         (b"\x10[]", "malformed"),
         (b'\x10{"identity": {}}', "malformed"),
-        (Hello(OURS, "ab12", 7, True).encode().replace(b"arrived", b"arrival"), "'arrived'"),
-        (Welcome(OURS, 0, 0.5, 1.0, 2.0).encode().replace(b"0.5", b'"x"'), "malformed"),
+        (AgentHello(OURS, "ab12", 7, True).encode().replace(b"arrived", b"arrival"), "'arrived'"),
+        (MasterWelcome(OURS, 0, 0.5, 1.0, 2.0).encode().replace(b"0.5", b'"x"'), "malformed"),
         (b"\x12\xff", "malformed"),
-        (Hello(replace(OURS, name="\ud800"), "ab12", 7, True).encode(), "UnicodeEncodeError"),
-        (Hello(replace(OURS, uid="\ud800"), "ab12", 7, True).encode(), "UnicodeEncodeError"),
-        (Hello(replace(OURS, name="a" * 60_000), "ab12", 7, True).encode(), "60000 characters"),
+        (AgentHello(replace(OURS, name="\ud800"), "ab12", 7, True).encode(), "UnicodeEncodeError"),
+        (AgentHello(replace(OURS, uid="\ud800"), "ab12", 7, True).encode(), "UnicodeEncodeError"),
+        (
+            AgentHello(replace(OURS, name="a" * 60_000), "ab12", 7, True).encode(),
+            "60000 characters",
+        ),
         (b"\x10" + b"[" * 30_000, "RecursionError"),
-        (Welcome(OURS, 31, 1.0, 2.0, 3.0).encode().replace(b"31", b"Infinity"), "OverflowError"),
+        (
+            MasterWelcome(OURS, 31, 1.0, 2.0, 3.0).encode().replace(b"31", b"Infinity"),
+            "OverflowError",
+        ),
     ],
 )
 def test_what_is_no_greeting_is_named(datagram: bytes, complaint: str) -> None:
     with pytest.raises(ProtocolError, match=complaint):
-        decode(datagram)
+        decode_greeting(datagram)
 
 
 @given(st.sampled_from([0x10, 0x11, 0x12, 0x13]), st.binary(max_size=50))
 def test_noise_raises_nothing_but_protocol_error(kind: int, noise: bytes) -> None:
     try:
-        decode(bytes([kind]) + noise)
+        decode_greeting(bytes([kind]) + noise)
     except ProtocolError:
         pass
 
@@ -82,7 +95,7 @@ def test_noise_raises_nothing_but_protocol_error(kind: int, noise: bytes) -> Non
     ],
 )
 def test_versions_must_fit(theirs: Identity, complaint: str | None) -> None:
-    error = mismatch(OURS, theirs)
+    error = version_mismatch(OURS, theirs)
     assert (error is None) == (complaint is None)
     assert complaint is None or str(error).startswith(complaint)
 

@@ -31,7 +31,7 @@ from fiber._hub.local import LocalChannel, QuietSocket
 from fiber._hub.protocol import NO_SECRET, ONE, SECRET, Op
 from fiber._runtime import state
 from fiber._sync import semaphore as shared_semaphore
-from fiber._transport import unix
+from fiber._transport import channels
 from fiber._transport.loop import Wakeup
 from fiber._wire import descriptor, memory_files, packet
 from fiber._wire.memory_files import Arena, MessageBlock
@@ -113,7 +113,7 @@ def test_ctrl_c_at_any_step_of_a_put_costs_no_place_and_no_join(
     if fed:
         monkeypatch.setattr(LocalChannel, "can_try_send", False)
         monkeypatch.setattr(feeder.Feeder, "_start_thread", lambda _: None)
-    files = {queues.__file__, feeder.__file__, unix.__file__}
+    files = {queues.__file__, feeder.__file__, channels.__file__}
 
     def put(stop: int) -> bool:
         """Whether the put was interrupted, at its step number ``stop``."""
@@ -501,7 +501,7 @@ def test_whatever_interrupts_a_large_message_none_is_damaged_and_no_descriptor_l
     def strike(step: int) -> bool:
         """Whether the exchange was interrupted, at this step."""
         monkeypatch.setattr(packet, "_arena", Arena())
-        pair = unix.socketpair("testing")
+        pair = channels.socketpair("testing")
         with pair[0] as here, pair[1] as there:
             send, receive = partial(packet.send, here), partial(packet.receive_object, there)
             one, two = pickle.dumps(first), pickle.dumps(second)

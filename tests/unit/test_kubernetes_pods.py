@@ -17,7 +17,7 @@ from fiber._backends.kubernetes.pods import Pods
 from fiber._backends.kubernetes.program import PreparedPool
 from fiber._backends.kubernetes.template import Shape
 from fiber._backends.remote import RemoteChild
-from fiber._transport.handshake import Identity
+from fiber._transport.authentication import Identity
 from fiber._transport.loop import Loop
 from fiber.config import Config
 from fiber.errors import FiberError, FiberPoolError

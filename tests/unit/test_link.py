@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
+from fiber._transport.authentication import Identity
 from fiber._transport.credentials import MasterCredentials
-from fiber._transport.handshake import Identity
 from fiber._transport.link import Keepalive
 from fiber._transport.listener import MasterListener
 from patience import PATIENCE
@@ -182,7 +182,7 @@ ECHO = """
 import os, sys
 from fiber._transport.credentials import Credentials
 from fiber._transport.dialer import AgentDialer
-from fiber._transport.handshake import Identity
+from fiber._transport.authentication import Identity
 from fiber._transport.link import Keepalive
 from fiber._transport.loop import Loop
 

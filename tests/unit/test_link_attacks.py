@@ -14,9 +14,9 @@ from typing import Any
 
 import pytest
 
-from fiber._transport import tls
+from fiber._transport import authentication
+from fiber._transport.authentication import AgentHello, Identity, MasterRefusal, decode_greeting
 from fiber._transport.credentials import make_credentials
-from fiber._transport.handshake import Hello, Identity, Refusal, decode
 from fiber._transport.listener import MasterListener
 from fiber.errors import AuthenticationError, LinkError
 from patience import PATIENCE
@@ -219,10 +219,10 @@ def test_a_stolen_agents_key_opens_no_other_agents_link(site: Site, claims: str)
     master.wait(lambda: master.frames)
     thief = Identity.of_this_process("agent-2", "uid", host="here")
     (name,) = listener._links  # even if the thief knew it
-    hello = Hello(thief, name, 0, claims == "to go on with a link")
+    hello = AgentHello(thief, name, 0, claims == "to go on with a link")
     stolen = site.credentials.agent("agent-2", "uid")
-    answer = decode(say(listener.address, stolen, hello.encode()))
-    assert isinstance(answer, Refusal)
+    answer = decode_greeting(say(listener.address, stolen, hello.encode()))
+    assert isinstance(answer, MasterRefusal)
     assert "the link of 'agent-1'" in answer.reason
     agent.link.send(b"still mine")
     master.wait(lambda: len(master.frames) == 2)
@@ -247,14 +247,14 @@ def test_a_proof_is_good_for_one_master_alone(site: Site) -> None:
     """Who shows another certificate in the middle cannot pass an agent's proof on."""
     pool_key = site.credentials.pool_key
     listener, master = site.listener()
-    middle = tls.agent_context()
+    middle = authentication.agent_context()
     credentials = make_credentials(pool_key).agent("agent-1", "uid")
-    hello = Hello(Identity.of_this_process("agent-1", "uid"), "0" * 32, 0, False).encode()
+    hello = AgentHello(Identity.of_this_process("agent-1", "uid"), "0" * 32, 0, False).encode()
     sock = socket.create_connection(("127.0.0.1", port_of(listener.address)), PATIENCE)
-    handshake = tls.AgentHandshake(sock, middle)
+    handshake = authentication.AgentHandshake(sock, middle)
     handshake.sock.getpeercert = lambda binary_form=False: b"what the one in the middle shows"
     try:
-        with pytest.raises(tls.Untrusted, match="does not believe"):
+        with pytest.raises(authentication.Untrusted, match="does not believe"):
             complete(handshake, handshake.ask(credentials, hello))
     finally:
         handshake.close()
@@ -272,8 +272,8 @@ def test_nobody_is_talked_into_an_older_tls(
         context.maximum_version = ssl.TLSVersion.TLSv1_2
         return context
 
-    made: Any = getattr(tls, f"{who}_context")
-    monkeypatch.setattr(tls, f"{who}_context", older)
+    made: Any = getattr(authentication, f"{who}_context")
+    monkeypatch.setattr(authentication, f"{who}_context", older)
     listener, master = site.listener()
     _, agent = site.dialer(listener.address)
     agent.wait(lambda: agent.errors)

@@ -13,9 +13,9 @@ import pynng
 import pytest
 
 from faults.program import wait_for
-from fiber._transport import dialer, tls
+from fiber._transport import authentication, dialer
+from fiber._transport.authentication import AgentHello, Identity
 from fiber._transport.credentials import Credentials, make_credentials
-from fiber._transport.handshake import Hello, Identity
 from fiber._transport.link import Keepalive
 from fiber.errors import AuthenticationError, ConfigError, LinkError, VersionMismatch
 from unit.link_site import Site, black_hole, free_port, port_of, say, vanish
@@ -300,12 +300,12 @@ def test_another_patch_level_of_python_will_do(site: Site) -> None:
 
 def test_who_is_no_agent_is_refused(site: Site) -> None:
     listener, master = site.listener()
-    with pytest.raises(tls.HungUp):
+    with pytest.raises(authentication.HungUp):
         say(listener.address, site.credentials.agent("a", "uid"), b"GET / HTTP/1.1")
     master.wait(lambda: master.refusals)
     assert "no agent of Fiber" in master.refusals[0]
 
 
 def test_a_greeting_carries_nothing_but_who_and_where() -> None:
-    hello = Hello(Identity.of_this_process("agent-1", "uid"), "session", 3, True)
+    hello = AgentHello(Identity.of_this_process("agent-1", "uid"), "session", 3, True)
     assert b"PRIVATE" not in hello.encode()

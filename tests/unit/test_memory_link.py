@@ -8,8 +8,8 @@ import pytest
 
 import fiber._transport.link
 import memory_link
-from fiber._transport.link import Keepalive, ResumableLink
-from fiber._transport.stream import Frame
+from fiber._transport.link import Keepalive, Link
+from fiber._transport.link_protocol import Frame
 from memory_link import Cable, SimulatedLoop
 from unit.interrupting import is_interrupted
 
@@ -17,7 +17,7 @@ from unit.interrupting import is_interrupted
 class Notes:
     """An observer that writes down what it hears."""
 
-    def __init__(self, link: ResumableLink) -> None:
+    def __init__(self, link: Link) -> None:
         self.frames: list[bytes] = []
         self.events: list[str] = []
         link.attach(self)
@@ -54,7 +54,7 @@ def run_schedule(seed: int) -> None:
     loop, rng = SimulatedLoop(), random.Random(seed)
     cable = Cable(loop, seed=seed, drop=rng.choice((0, 0.2)), delay=(0, rng.choice((0.001, 0.3))))
     notes = {link: Notes(link) for link in (cable.agent, cable.master)}
-    sent: dict[ResumableLink, list[bytes]] = {cable.agent: [], cable.master: []}
+    sent: dict[Link, list[bytes]] = {cable.agent: [], cable.master: []}
     faults = [cable.break_off, cable.cut, cable.mend]
     for number in range(60):
         link = rng.choice((cable.agent, cable.master))
@@ -235,7 +235,7 @@ def test_an_observer_that_fails_on_a_frame_loses_the_peer(loop: SimulatedLoop) -
 def test_a_peer_that_talks_nonsense_is_lost(loop: SimulatedLoop) -> None:
     cable = Cable(loop)
     notes = Notes(cable.master)
-    wire = cable.agent._wire
+    wire = cable.agent._connection
     assert wire is not None
     wire.put(b"nonsense that is long enough to have a header")
     loop.run_for(1)

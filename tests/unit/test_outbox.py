@@ -12,8 +12,8 @@ from collections.abc import Iterator
 import pytest
 
 import census
+from fiber._transport.channels import Outbox, socketpair
 from fiber._transport.loop import Loop
-from fiber._transport.unix import Outbox, socketpair
 from fiber._wire import packet
 from fiber.errors import TooManyOpenFiles
 from patience import PATIENCE

@@ -15,7 +15,7 @@ import pytest
 
 from fiber import reduction
 from fiber._agent import child
-from fiber._transport.unix import socketpair
+from fiber._transport.channels import socketpair
 from fiber._wire import packet
 from fiber._wire.descriptor import Descriptor
 from fiber.connection import Pipe

@@ -11,7 +11,7 @@ import pytest
 
 from fiber._agent.interface import ChildSpec
 from fiber._backends.remote import RemoteAgent, RemoteChild
-from fiber._transport.stream import Lane
+from fiber._transport.link_protocol import Lane
 from fiber._wire import messages
 from fiber._wire.memory_files import BytesLike
 from memory_link import SimulatedLoop

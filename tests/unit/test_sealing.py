@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fiber._transport import sealing
-from fiber._transport.sealing import OVERHEAD, Opener, Sealer, derive
+from fiber._transport import nng
+from fiber._transport.authentication import derive
+from fiber._transport.nng import OVERHEAD, Opener, Sealer
 from fiber._wire.messages import ProtocolError
 
 SECRET = bytes(range(32))
@@ -53,7 +54,7 @@ def test_no_nonce_comes_twice_under_a_key(monkeypatch: pytest.MonkeyPatch) -> No
         def encrypt_into(self, nonce: bytes, *_: object) -> None:
             used.append((self._key, nonce))
 
-    monkeypatch.setattr(sealing, "AESGCM", Recorder)
+    monkeypatch.setattr(nng, "AESGCM", Recorder)
     secrets = derive(os.urandom(32), os.urandom(32), for_master=True)
     for secret in secrets:
         sealer = Sealer(secret, 7)
@@ -64,8 +65,8 @@ def test_no_nonce_comes_twice_under_a_key(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_the_limits_are_far_below_what_gcm_bears() -> None:
-    assert sealing.MESSAGES_PER_KEY < 2**32
-    assert sealing.BYTES_PER_KEY <= 2**36
+    assert nng.MESSAGES_PER_KEY < 2**32
+    assert nng.BYTES_PER_KEY <= 2**36
 
 
 @pytest.mark.parametrize("at", [0, 5, 20])

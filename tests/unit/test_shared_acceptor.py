@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from fiber._transport.acceptor import Acceptor
+from fiber._transport.authentication import Identity
 from fiber._transport.credentials import MasterCredentials, make_credentials
-from fiber._transport.handshake import Identity
 from fiber.errors import AuthenticationError, LinkError
 from unit.link_site import Notes, Site
 

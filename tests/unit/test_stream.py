@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fiber._transport.stream import (
+from fiber._transport.link_protocol import (
     ACK_DELAY,
     BUDGET,
     FIRST,
@@ -22,7 +22,7 @@ from fiber._transport.stream import (
     WINDOW_BYTES,
     Datagram,
     Gap,
-    ResumableStream,
+    LinkProtocol,
 )
 from fiber._wire.messages import ProtocolError
 
@@ -36,7 +36,7 @@ class Network:
         self.rng = rng
         self.drop, self.repeat, self.swap = drop, repeat, swap
         self.now = 100.0
-        self.ends = [ResumableStream(self.now, budget=BUDGET_SMALL) for _ in range(2)]
+        self.ends = [LinkProtocol(self.now, budget=BUDGET_SMALL) for _ in range(2)]
         self.flying: list[list[bytes]] = [[], []]
         self.got: list[list[bytes]] = [[], []]
         self.sent: list[list[bytes]] = [[], []]
@@ -176,15 +176,15 @@ def joined(datagram: Datagram) -> bytes:
     return datagram if isinstance(datagram, bytes) else b"".join(datagram)
 
 
-def pair(now: float = 0.0, *, budget: int = BUDGET) -> tuple[ResumableStream, ResumableStream]:
-    one, other = (ResumableStream(now, budget=budget) for _ in range(2))
+def pair(now: float = 0.0, *, budget: int = BUDGET) -> tuple[LinkProtocol, LinkProtocol]:
+    one, other = (LinkProtocol(now, budget=budget) for _ in range(2))
     one.connected(0)
     other.connected(0)
     meet(one, other, now)
     return one, other
 
 
-def meet(one: ResumableStream, other: ResumableStream, now: float) -> None:
+def meet(one: LinkProtocol, other: LinkProtocol, now: float) -> None:
     """Exchange what both have to say."""
     for datagram in one.outgoing(now):
         other.received(datagram, now)
@@ -193,7 +193,7 @@ def meet(one: ResumableStream, other: ResumableStream, now: float) -> None:
 
 
 def test_both_speak_at_once_so_that_each_knows_that_the_connection_works() -> None:
-    one, other = ResumableStream(0), ResumableStream(0)
+    one, other = LinkProtocol(0), LinkProtocol(0)
     one.connected(0)
     other.connected(0)
     assert not other.heard

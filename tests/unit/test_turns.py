@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from fiber._transport.stream import SLOTS, Lane, ResumableStream, Turns
+from fiber._transport.link_protocol import SLOTS, Lane, LinkProtocol, SendQueue
 from fiber._wire import memory_files
 
 BUDGET = 64
@@ -15,14 +15,14 @@ LARGE = 10 * BUDGET
 
 
 @pytest.fixture
-def ends() -> tuple[ResumableStream, ResumableStream]:
-    sender, receiver = (ResumableStream(0, budget=BUDGET) for _ in range(2))
+def ends() -> tuple[LinkProtocol, LinkProtocol]:
+    sender, receiver = (LinkProtocol(0, budget=BUDGET) for _ in range(2))
     sender.connected(0)
     receiver.connected(0)
     return sender, receiver
 
 
-def arriving(sender: ResumableStream, receiver: ResumableStream) -> Iterator[bytes]:
+def arriving(sender: LinkProtocol, receiver: LinkProtocol) -> Iterator[bytes]:
     """The frames, in the order in which they are complete."""
     while not sender.idle:
         for datagram in sender.outgoing(0):
@@ -37,7 +37,7 @@ def filled(number: int, size: int) -> bytes:
 
 
 def test_small_frames_pass_a_large_one_of_another_lane(
-    ends: tuple[ResumableStream, ResumableStream],
+    ends: tuple[LinkProtocol, LinkProtocol],
 ) -> None:
     sender, receiver = ends
     large = filled(1, LARGE)
@@ -49,7 +49,7 @@ def test_small_frames_pass_a_large_one_of_another_lane(
 
 
 def test_the_frames_of_a_lane_keep_their_order(
-    ends: tuple[ResumableStream, ResumableStream],
+    ends: tuple[LinkProtocol, LinkProtocol],
 ) -> None:
     sender, receiver = ends
     frames = [filled(1, LARGE), b"behind it", filled(2, LARGE), b"last"]
@@ -60,7 +60,7 @@ def test_the_frames_of_a_lane_keep_their_order(
 
 
 def test_nothing_passes_what_has_no_lane(
-    ends: tuple[ResumableStream, ResumableStream],
+    ends: tuple[LinkProtocol, LinkProtocol],
 ) -> None:
     sender, receiver = ends
     sender.send(filled(1, 2 * BUDGET))
@@ -71,7 +71,7 @@ def test_nothing_passes_what_has_no_lane(
     assert arrived == [filled(1, 2 * BUDGET), filled(2, LARGE), b"small", filled(3, LARGE)]
 
 
-def test_large_frames_take_turns(ends: tuple[ResumableStream, ResumableStream]) -> None:
+def test_large_frames_take_turns(ends: tuple[LinkProtocol, LinkProtocol]) -> None:
     sender, receiver = ends
     sender.send(filled(1, 10 * LARGE), lane="long")
     sender.send(filled(2, LARGE), lane="short")
@@ -82,7 +82,7 @@ def test_large_frames_take_turns(ends: tuple[ResumableStream, ResumableStream]) 
 
 def test_small_frames_without_end_do_not_keep_a_large_one_waiting() -> None:
     left: list[str] = []
-    turns = Turns(BUDGET)
+    turns = SendQueue(BUDGET)
     turns.add([filled(1, LARGE)], "one", lambda: left.append("large"))
     for _ in range(4 * LARGE // BUDGET):
         for _ in range(10):
@@ -92,7 +92,7 @@ def test_small_frames_without_end_do_not_keep_a_large_one_waiting() -> None:
 
 
 def test_no_more_frames_than_slots_are_put_together_at_a_time(
-    ends: tuple[ResumableStream, ResumableStream],
+    ends: tuple[LinkProtocol, LinkProtocol],
 ) -> None:
     sender, receiver = ends
     frames = [filled(number, LARGE) for number in range(2 * SLOTS)]
@@ -107,7 +107,7 @@ def test_no_more_frames_than_slots_are_put_together_at_a_time(
     assert together <= SLOTS
 
 
-def test_it_says_when_a_frame_has_left(ends: tuple[ResumableStream, ResumableStream]) -> None:
+def test_it_says_when_a_frame_has_left(ends: tuple[LinkProtocol, LinkProtocol]) -> None:
     sender, receiver = ends
     left: list[str] = []
     sender.send(filled(1, LARGE), lane="one", on_left=lambda: left.append("large"))
@@ -120,9 +120,7 @@ def test_it_says_when_a_frame_has_left(ends: tuple[ResumableStream, ResumableStr
 
 
 def test_what_is_held_is_a_window_and_what_has_arrived() -> None:
-    sender, receiver = (
-        ResumableStream(0, budget=BUDGET, window_bytes=4 * BUDGET) for _ in range(2)
-    )
+    sender, receiver = (LinkProtocol(0, budget=BUDGET, window_bytes=4 * BUDGET) for _ in range(2))
     sender.connected(0)
     receiver.connected(0)
     sender.send(bytes(LARGE), lane="one")
@@ -142,7 +140,7 @@ def test_what_is_held_is_a_window_and_what_has_arrived() -> None:
 
 
 def test_a_stream_that_ends_forgets_what_has_arrived_of_a_frame(
-    ends: tuple[ResumableStream, ResumableStream],
+    ends: tuple[LinkProtocol, LinkProtocol],
 ) -> None:
     sender, receiver = ends
     sender.send(bytes(LARGE), lane="one")
@@ -160,7 +158,7 @@ def test_whatever_is_sent_arrives_in_the_order_that_is_promised(
 ) -> None:
     monkeypatch.setattr(memory_files, "IN_FILE", 3 * BUDGET)
     rng = random.Random(seed)
-    sender, receiver = (ResumableStream(0, budget=BUDGET) for _ in range(2))
+    sender, receiver = (LinkProtocol(0, budget=BUDGET) for _ in range(2))
     sender.connected(0)
     receiver.connected(0)
     sent: list[tuple[Lane, bytes]] = []

@@ -25,7 +25,7 @@ from fiber._agent import child, zygote, zygote_process
 from fiber._agent.last_words import ProgressTable
 from fiber._agent.preload import Imports
 from fiber._agent.service import is_expected
-from fiber._transport.unix import socketpair
+from fiber._transport.channels import socketpair
 from fiber._wire import packet
 from fiber.process import Process
 from patience import PATIENCE

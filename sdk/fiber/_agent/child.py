@@ -21,7 +21,7 @@ from fiber._agent.last_words import ProgressTable
 from fiber._agent.zygote_process import interpreter_arguments
 from fiber._hub import client as hub_client
 from fiber._hub.protocol import HubAddress
-from fiber._transport.unix import UnixChannel
+from fiber._transport.channels import UnixChannel
 from fiber._wire.descriptor import Descriptor, contents, own
 
 _LONGEST_LINE = 1 << 16

@@ -28,8 +28,8 @@ from fiber._agent.last_words import ProgressTable
 from fiber._agent.preload import Imports
 from fiber._agent.zygote_process import is_standard_stream
 from fiber._hub.protocol import HubAddress
+from fiber._transport.channels import Outbox, naming_the_limit, socketpair
 from fiber._transport.loop import Loop
-from fiber._transport.unix import Outbox, naming_the_limit, socketpair
 from fiber._wire import packet
 from fiber._wire.memory_files import Blob, BytesLike
 from fiber._wire.packet import Message

@@ -20,9 +20,9 @@ from fiber._agent.child import become_subreaper, go_on_without_parent
 from fiber._agent.service import AgentService
 from fiber._hub.directory import remove_directory
 from fiber._hub.hub import Hub
+from fiber._transport.authentication import Identity
 from fiber._transport.credentials import Credentials
 from fiber._transport.dialer import AgentDialer
-from fiber._transport.handshake import Identity
 from fiber._transport.link import Link
 from fiber._transport.loop import Loop
 from fiber.errors import AuthenticationError, ConfigError, FiberError, LinkError

@@ -22,10 +22,10 @@ from fiber._agent.interface import Cause, ChildSpec, ExitReport
 from fiber._agent.last_words import TELL
 from fiber._agent.local_child import LocalChild
 from fiber._hub.hub import Hub
+from fiber._transport.channels import naming_the_limit
 from fiber._transport.link import Link
+from fiber._transport.link_protocol import Frame
 from fiber._transport.loop import Loop
-from fiber._transport.stream import Frame
-from fiber._transport.unix import naming_the_limit
 from fiber._wire import messages, packet
 from fiber._wire.descriptor import contents
 from fiber._wire.memory_files import Blob, BytesLike, pass_on, place_of

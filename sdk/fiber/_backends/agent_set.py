@@ -11,7 +11,8 @@ from fiber._backends.output import Output
 from fiber._backends.remote import RemoteAgent, RemoteChild
 from fiber._engine.placement import Placement
 from fiber._hub.hub import Hub
-from fiber._transport.link import EventLoop, Link
+from fiber._transport.link import Link
+from fiber._transport.loop import EventLoop
 
 
 class AgentSet:

@@ -30,11 +30,11 @@ from fiber._backends.remote import RemoteAgent, RemoteChild
 from fiber._engine.placement import Placement
 from fiber._engine.start_failures import StartFailure, StartFailures
 from fiber._hub.hub import Hub
+from fiber._transport.authentication import Identity, join_address
 from fiber._transport.credentials import Credentials, make_credentials
-from fiber._transport.handshake import Identity, join_address
-from fiber._transport.link import Keepalive, Link, Timer
+from fiber._transport.link import Keepalive, Link
 from fiber._transport.listener import MasterListener
-from fiber._transport.loop import Loop
+from fiber._transport.loop import Loop, ScheduledCall
 from fiber.config import Config
 from fiber.errors import StartError
 
@@ -75,7 +75,7 @@ class LoopbackBackend:
         self._reasons: deque[str] = deque(maxlen=_REASONS)
         self._gave_up = False
         self._alone_since = 0.0
-        self._retry: Timer | None = None
+        self._retry: ScheduledCall | None = None
         self._closing = False
         self._numbers = itertools.count()
         self._limit = config.processes_per_agent or math.inf

@@ -20,8 +20,9 @@ from typing import Protocol
 from fiber._agent.interface import Cause, ChildObserver, ChildSpec, ExitReport
 from fiber._backends.output import Output
 from fiber._hub.hub import Hub
-from fiber._transport.link import EventLoop, Link
-from fiber._transport.stream import Frame
+from fiber._transport.link import Link
+from fiber._transport.link_protocol import Frame
+from fiber._transport.loop import EventLoop
 from fiber._wire import messages, packet
 from fiber._wire.memory_files import Blob, BytesLike
 from fiber._wire.packet import Message

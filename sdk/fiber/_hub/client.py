@@ -17,7 +17,7 @@ from fiber._hub import protocol
 from fiber._hub.local import QuietSocket, without_timeout
 from fiber._hub.protocol import HEAD, ONE, SECRETS, Doorbell, HubAddress, Op, Status
 from fiber._hub.registry import Registry
-from fiber._transport.unix import naming_the_limit, wait_readable
+from fiber._transport.channels import naming_the_limit, wait_readable
 from fiber._wire import packet
 from fiber._wire.descriptor import Descriptor
 from fiber._wire.memory_files import BytesLike

@@ -20,7 +20,7 @@ from fiber._hub.handles import collecting_grants
 from fiber._hub.local import LocalChannel
 from fiber._hub.one_way import Receiver, Sender
 from fiber._hub.remote import RemoteObject
-from fiber._transport.base import Channel
+from fiber._transport.channels import Channel
 from fiber._wire import packet
 from fiber._wire.packet import Message
 from fiber.errors import ConnectionClosed

@@ -27,7 +27,7 @@ from fiber._hub.local import LocalCounter
 from fiber._hub.shared_semaphores import AnySemaphore
 from fiber._hub.wait_lists import AnyWaitList
 from fiber._sync.semaphore import COUNTING
-from fiber._transport.base import SharedChannel, SharedCounter
+from fiber._transport.channels import SharedChannel, SharedCounter
 from fiber._wire import packet
 from fiber._wire.packet import Message
 

@@ -40,8 +40,7 @@ from fiber._hub.protocol import (
 )
 from fiber._hub.registry import NoSuchObject, Registry
 from fiber._hub.remote import RemoteChannel, RemoteCounter, RemoteEnd, RemoteObject
-from fiber._transport.base import SharedChannel, SharedCounter
-from fiber._transport.unix import UnixChannel, UnixCounter
+from fiber._transport.channels import SharedChannel, SharedCounter, UnixChannel, UnixCounter
 from fiber._wire.descriptor import Descriptor, opened, own
 
 

@@ -20,7 +20,7 @@ import weakref
 from collections import deque
 from typing import Any
 
-from fiber._transport.unix import naming_the_limit
+from fiber._transport.channels import naming_the_limit
 from fiber._wire.descriptor import Descriptor, opened
 
 SEGMENT = 1 << 20

@@ -42,8 +42,8 @@ from fiber._hub.replicas import MemoryLink, Replicas
 from fiber._hub.streams import Poller, SocketStream, Stream
 from fiber._hub.tunnel import Frame as TunnelFrame
 from fiber._hub.tunnel import Router, Tunnels
+from fiber._transport.channels import naming_the_limit, socketpair
 from fiber._transport.loop import DOZE, Loop
-from fiber._transport.unix import naming_the_limit, socketpair
 from fiber._wire.descriptor import Descriptor, own
 from fiber._wire.messages import HubMessage, MemoryMessage
 from fiber.errors import TooManyOpenFiles

@@ -10,9 +10,8 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any, TypeVar
 
-from fiber._transport.base import Claimant
+from fiber._transport.channels import Claimant, UnixChannel, UnixCounter, grow
 from fiber._transport.loop import LONGEST_POLL
-from fiber._transport.unix import UnixChannel, UnixCounter, grow
 from fiber._wire import packet
 from fiber._wire.descriptor import Descriptor
 from fiber._wire.memory_files import BytesLike

@@ -37,7 +37,7 @@ from fiber._hub import heap
 from fiber._hub.local import LocalChannel
 from fiber._hub.protocol import ObjectKind
 from fiber._sync.liveness import RobustMutex
-from fiber._transport.unix import BorrowedSocket, wait_readable, wait_until
+from fiber._transport.channels import BorrowedSocket, wait_readable, wait_until
 from fiber._wire import packet
 from fiber._wire.descriptor import Descriptor
 from fiber._wire.memory_files import BytesLike

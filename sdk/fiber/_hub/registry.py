@@ -26,7 +26,7 @@ from fiber._hub.hosted import (
     HostedWaitList,
 )
 from fiber._hub.protocol import NO_SECRET, SECRET_BYTES, WHOLE, Extent, ObjectKind
-from fiber._transport.unix import naming_the_limit
+from fiber._transport.channels import naming_the_limit
 from fiber._wire.descriptor import Descriptor, opened
 
 Hosted: TypeAlias = HostedChannel | HostedCounter | HostedMemory | HostedSemaphore | HostedWaitList

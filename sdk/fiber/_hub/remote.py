@@ -29,8 +29,7 @@ from fiber._hub.protocol import (
     Op,
     Status,
 )
-from fiber._transport.base import Claimant
-from fiber._transport.unix import wait_readable
+from fiber._transport.channels import Claimant, wait_readable
 from fiber._wire import packet
 from fiber._wire.memory_files import BytesLike
 from fiber._wire.packet import Message

@@ -33,7 +33,7 @@ from fiber._hub import handles
 from fiber._hub.client import Unreachable, host
 from fiber._hub.handles import HubHandle, collecting_grants
 from fiber._hub.local import LocalChannel
-from fiber._transport.base import Channel
+from fiber._transport.channels import Channel
 from fiber._wire import packet
 from fiber.connection import how_it_ended
 from fiber.errors import ConnectionClosed

@@ -35,7 +35,7 @@ from fiber._managers.client import (
     receive_notice,
 )
 from fiber._managers.locks import CONTENDED, Client, ClientThread, LockTable
-from fiber._transport.base import Channel
+from fiber._transport.channels import Channel
 from fiber._wire import packet
 from fiber._wire.packet import Message
 from fiber.errors import ConnectionClosed

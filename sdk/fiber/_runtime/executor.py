@@ -50,7 +50,7 @@ from fiber._runtime.work_items import (
     pickle_call,
 )
 from fiber._runtime.workers import Launcher, WorkerHandle, WorkerResources, WorkerView
-from fiber._transport.loop import Timer
+from fiber._transport.loop import LoopTimer
 from fiber._wire import work
 from fiber._wire.packet import Message
 from fiber.errors import FiberError
@@ -128,7 +128,7 @@ class PoolExecutor:
             advance=self._advance,
         )
         """The calls of single functions."""
-        self._wake: Timer | None = None
+        self._wake: LoopTimer | None = None
         self._ended_by: BaseException | None = None
         """Error of calls that are not done when the pool is terminated."""
         self._acting = False

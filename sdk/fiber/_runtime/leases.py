@@ -30,7 +30,7 @@ from fiber._engine.tasks import WrongAnswer
 from fiber._runtime.answers import OTHER, Words, read, single
 from fiber._runtime.work_items import Call
 from fiber._runtime.workers import WorkerHandle
-from fiber._transport.loop import Loop, Timer
+from fiber._transport.loop import Loop, LoopTimer
 from fiber._wire import work
 from fiber._wire.packet import Message
 
@@ -108,7 +108,7 @@ class Leases:
         self._loop = loop
         self._on_adopted = on_adopted
         self._on_back = on_back
-        self._check: Timer | None = None
+        self._check: LoopTimer | None = None
         self._idle: deque[Lease] = deque()
         self._leases: dict[weakref.ref[Lease], LeasedWorker] = {}
         self._workers: dict[WorkerHandle, LeasedWorker] = {}

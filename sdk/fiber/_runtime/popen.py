@@ -13,8 +13,8 @@ from fiber._agent.last_words import TELL
 from fiber._exceptions import fresh
 from fiber._runtime.latch import Latch
 from fiber._runtime.state import runtime
+from fiber._transport.channels import naming_the_limit
 from fiber._transport.loop import Wakeup
-from fiber._transport.unix import naming_the_limit
 from fiber._wire.packet import Message
 from fiber.errors import FiberError, StartError
 

@@ -18,7 +18,7 @@ from fiber._runtime.background import BackgroundThread
 from fiber._runtime.jobs import Jobs
 from fiber._runtime.work_items import Call, WorkItem, is_wanted
 from fiber._runtime.workers import WorkerHandle
-from fiber._transport.loop import Loop, Timer
+from fiber._transport.loop import Loop, LoopTimer
 from fiber._wire import work
 
 STACK_PATIENCE = 1.0
@@ -200,8 +200,8 @@ class TimeLimits:
         self._ledger = scheduler.ledger
         self._jobs = jobs
         self._advance = advance
-        self._timers: dict[int, Timer] = {}
-        self._ending: dict[WorkerHandle, tuple[int, Timer]] = {}
+        self._timers: dict[int, LoopTimer] = {}
+        self._ending: dict[WorkerHandle, tuple[int, LoopTimer]] = {}
         """Batches whose time is over, with timers that wait for the ends of their workers."""
 
     def begin(self, seq: int, seconds: float) -> None:

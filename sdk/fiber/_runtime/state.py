@@ -22,8 +22,8 @@ from fiber._hub import client as hub_client
 from fiber._hub.handles import GrantSet, collecting_grants
 from fiber._hub.hub import Hub
 from fiber._runtime import start_methods
+from fiber._transport.channels import naming_the_limit
 from fiber._transport.loop import Loop
-from fiber._transport.unix import naming_the_limit
 from fiber._wire.memory_files import Blob
 from fiber.errors import StartError
 from fiber.resources import resources_of

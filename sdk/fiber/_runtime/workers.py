@@ -21,7 +21,7 @@ from fiber._runtime.background import BackgroundThread
 from fiber._runtime.latch import Latch
 from fiber._runtime.options import PoolOptions
 from fiber._runtime.state import Runtime, SharedArguments
-from fiber._transport.loop import Loop, Timer, Wakeup
+from fiber._transport.loop import Loop, LoopTimer, Wakeup
 from fiber._wire import work
 from fiber._wire.packet import Message
 from fiber.errors import FiberError
@@ -285,7 +285,7 @@ class Launcher:
         self._background = background
         self._on_failed = on_failed
         self._ending: list[WorkerHandle] = []
-        self._kill: Timer | None = None
+        self._kill: LoopTimer | None = None
 
     def make(self, supervisor: Supervisor, count: int) -> list[WorkerHandle]:
         """Return handles of workers to be started."""

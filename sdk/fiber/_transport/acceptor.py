@@ -27,11 +27,17 @@ import threading
 from collections.abc import Callable, Hashable
 from typing import NamedTuple
 
-from fiber._transport import handshake, tls
+from fiber._transport import authentication
+from fiber._transport.authentication import (
+    AgentHello,
+    Identity,
+    MasterRefusal,
+    Secrets,
+    join_address,
+    parse_address,
+)
 from fiber._transport.credentials import Certificate, MasterCredentials
-from fiber._transport.handshake import Hello, Identity, Refusal, join_address, parse_address
 from fiber._transport.loop import Loop
-from fiber._transport.sealing import Secrets
 from fiber._wire.messages import ProtocolError
 from fiber.errors import LinkError, TooManyOpenFiles
 
@@ -63,7 +69,7 @@ class ServedPool(NamedTuple):
     """Pool whose agents dial the acceptor.  Both functions run on the acceptor's thread."""
 
     credentials: MasterCredentials
-    on_agent: Callable[[PendingConnection, Hello], None]
+    on_agent: Callable[[PendingConnection, AgentHello], None]
     """Called with a connection that has proved to be an agent of the pool."""
     on_refused: Callable[[str], None]
     """Called with why a connection was turned away, once in some minutes for each address and
@@ -82,7 +88,7 @@ class Acceptor:
 
     def __init__(self, address: str, certificate: Certificate) -> None:
         self.certificate = certificate
-        self.context = tls.master_context(certificate)
+        self.context = authentication.master_context(certificate)
         self.loop = Loop()
         self._lock = threading.Lock()
         self._pools: tuple[ServedPool, ...] = ()
@@ -188,7 +194,7 @@ class Acceptor:
         self._pending.add(connection)
         try:
             connection.start(sock)
-        except tls.HungUp:
+        except authentication.HungUp:
             self.forget(connection)
 
     def _close(self) -> None:
@@ -216,18 +222,20 @@ class PendingConnection:
         with contextlib.suppress(OSError):  # no TCP, or broken already
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         acceptor = self._acceptor
-        self._handshake = tls.MasterHandshake(sock, acceptor.context, acceptor.certificate)
+        self._handshake = authentication.MasterHandshake(
+            sock, acceptor.context, acceptor.certificate
+        )
         self._timer = self._loop.call_later(_DEADLINE, self._too_late)
         self._run(self._handshake.listen(), self._hear)
 
     def _hear(self, words: bytes) -> None:
         """Find the pool of the agent by its greeting and its proof."""
         try:
-            hello = handshake.decode(words)
+            hello = authentication.decode_greeting(words)
         except ProtocolError as error:
             self._distrust(f"it is no agent of Fiber: {error}")
             return
-        if not isinstance(hello, Hello):
+        if not isinstance(hello, AgentHello):
             self._distrust(f"{hello.identity.name!r} is no agent")
             return
         name, uid = hello.identity.name, hello.identity.uid
@@ -303,7 +311,11 @@ class PendingConnection:
         self._timer.cancel()
         self._acceptor.forget(self)
 
-    def _run(self, steps: tls.Steps[tls._T], then: Callable[[tls._T], None]) -> None:
+    def _run(
+        self,
+        steps: authentication.Steps[authentication._T],
+        then: Callable[[authentication._T], None],
+    ) -> None:
         """Take one of the ``steps`` each time the connection is ready."""
 
         def step() -> None:
@@ -312,7 +324,7 @@ class PendingConnection:
             except StopIteration as finished:
                 self._unwatch()
                 then(finished.value)
-            except (tls.Untrusted, tls.HungUp, ProtocolError) as error:
+            except (authentication.Untrusted, authentication.HungUp, ProtocolError) as error:
                 self._acceptor.report(self._host, self.origin, str(error))
                 self._part()
 
@@ -362,9 +374,9 @@ class PendingConnection:
             self.refuse(f"it did not prove itself within {_DEADLINE:g} s")
 
 
-def _turn_away(connection: PendingConnection, hello: Hello) -> None:
+def _turn_away(connection: PendingConnection, hello: AgentHello) -> None:
     reason = "this master has given back the pool of this agent"
-    refusal = Refusal(Identity.of_this_process(MASTER), reason)
+    refusal = MasterRefusal(Identity.of_this_process(MASTER), reason)
     connection.turn_away(refusal.encode(), reason)
 
 
@@ -412,7 +424,7 @@ _FAIR_CHANCE = 1.0
 """Seconds for which a newcomer replaces no connection; a handshake takes some hundredths of one."""
 
 
-class Verdict(NamedTuple):
+class AdmissionDecision(NamedTuple):
     """Decision about a newcomer, and the connection that it replaces, if any."""
 
     admitted: bool
@@ -431,18 +443,18 @@ class Admission:
     def __len__(self) -> int:
         return len(self._addresses)
 
-    def enter(self, newcomer: Hashable, address: str, now: float) -> Verdict:
+    def enter(self, newcomer: Hashable, address: str, now: float) -> AdmissionDecision:
         """Decide whether ``newcomer`` is admitted."""
         crowd = self._crowd(address)
         leaves = None
         if crowd:
             leaves, since = next(iter(crowd.items()))
             if now - since < _FAIR_CHANCE:
-                return Verdict(False)
+                return AdmissionDecision(False)
             self.leave(leaves)
         self._waiting.setdefault(address, {})[newcomer] = now
         self._addresses[newcomer] = address
-        return Verdict(True, leaves)
+        return AdmissionDecision(True, leaves)
 
     def leave(self, one: Hashable) -> None:
         """Remove a connection that has proved itself, or has ended."""

@@ -21,12 +21,19 @@ from itertools import chain, zip_longest
 from typing import NamedTuple
 
 from fiber._exceptions import fresh
-from fiber._transport import handshake, tls
+from fiber._transport import authentication
+from fiber._transport.authentication import (
+    AgentHello,
+    Identity,
+    MasterRefusal,
+    MasterWelcome,
+    Secrets,
+    parse_addresses,
+)
 from fiber._transport.credentials import Credentials
-from fiber._transport.handshake import Hello, Identity, Refusal, Welcome, parse_addresses
-from fiber._transport.link import Keepalive, Link, ResumableLink, SelectorEventLoop, Wire
-from fiber._transport.nng import Connection
-from fiber._transport.sealing import Secrets
+from fiber._transport.link import Keepalive, Link, LinkConnection
+from fiber._transport.loop import Loop
+from fiber._transport.nng import SealedConnection
 from fiber._wire.messages import ProtocolError
 from fiber.errors import AuthenticationError, FiberError, LinkError
 
@@ -47,7 +54,7 @@ _LONGER = 2
 """Factor by which an agent waits longer in silence than its master does."""
 
 
-class Unreachable(Exception):
+class MasterUnreachable(Exception):
     """No master took the connection, or it ended before the welcome."""
 
 
@@ -62,7 +69,7 @@ class AgentDialer:
 
     def __init__(
         self,
-        loop: SelectorEventLoop,
+        loop: Loop,
         address: str,
         credentials: Credentials,
         identity: Identity,
@@ -76,14 +83,14 @@ class AgentDialer:
         self._loop = loop
         self._address = address
         self._credentials = credentials
-        self._context = tls.agent_context()
+        self._context = authentication.agent_context()
         self._identity = identity
         self._on_link = on_link
         self._on_failed = on_failed
         self._timeout = timeout
         self._connect = connect or _connect
         self._name = secrets.token_hex(16)
-        self._link: ResumableLink | None = None
+        self._link: Link | None = None
         self._obstacle = "nothing was tried"
         self.epoch = credentials.epoch
         """Epoch of the master, once there is a link."""
@@ -105,7 +112,7 @@ class AgentDialer:
             return
         link = self._link
         welcomed, arrived = (link.heard, link.arrived) if link else (False, 0)
-        hello = Hello(self._identity, self._name, arrived, welcomed).encode()
+        hello = AgentHello(self._identity, self._name, arrived, welcomed).encode()
         # Names are resolved and connections made by calls that block, so they get a thread.
         dial = threading.Thread(
             target=self._dial, args=(hello, pause), name="fiber-dial", daemon=True
@@ -124,7 +131,7 @@ class AgentDialer:
             began = time.monotonic()
             try:
                 met = self._meet(hello)
-            except tls.Untrusted as error:
+            except authentication.Untrusted as error:
                 self._obstacle = str(error)
                 if self._link is None:
                     self._loop.call_soon(self._distrust)
@@ -132,7 +139,7 @@ class AgentDialer:
             except ProtocolError as error:
                 self._loop.call_soon(self._no_master, error)
                 return
-            except (Unreachable, tls.HungUp) as error:
+            except (MasterUnreachable, authentication.HungUp) as error:
                 # No master listens yet, or there is no route to it yet.
                 self._obstacle = str(error)
             else:
@@ -148,7 +155,7 @@ class AgentDialer:
     def _meet(self, hello: bytes) -> tuple[bytes, int, Secrets]:
         """The master's answer, and the connection without TLS."""
         sock = self._connect(self._address)
-        tls_handshake = tls.AgentHandshake(sock, self._context)
+        tls_handshake = authentication.AgentHandshake(sock, self._context)
         try:
             with self._lock:
                 self._sock = tls_handshake.sock
@@ -163,18 +170,21 @@ class AgentDialer:
             tls_handshake.close()
 
     def _finish(
-        self, tls_handshake: tls.AgentHandshake, steps: tls.Steps[tls._T], deadline: float
-    ) -> tls._T:
+        self,
+        tls_handshake: authentication.AgentHandshake,
+        steps: authentication.Steps[authentication._T],
+        deadline: float,
+    ) -> authentication._T:
         """Take the steps, waiting before each until it can be taken."""
         poller = select.poll()
         try:
             while not self._over.is_set():
                 poller.register(tls_handshake.sock, next(steps))
                 if not poller.poll(max(deadline - time.monotonic(), 0.0) * 1000):
-                    raise Unreachable("it took the connection and said nothing")
+                    raise MasterUnreachable("it took the connection and said nothing")
         except StopIteration as finished:
             return finished.value  # type: ignore[no-any-return]  # typeshed cannot know
-        raise Unreachable("it was given up")
+        raise MasterUnreachable("it was given up")
 
     # On the loop's thread
 
@@ -190,16 +200,16 @@ class AgentDialer:
         else:
             self._welcomed(welcome, descriptor, secrets)
 
-    def _welcome_in(self, answer: bytes) -> Welcome:
+    def _welcome_in(self, answer: bytes) -> MasterWelcome:
         """Return the welcome in the answer of the master; raise an error if it is none."""
         try:
-            greeting = handshake.decode(answer)
+            greeting = authentication.decode_greeting(answer)
         except ProtocolError as error:
             raise self._stranger(error) from error
-        mismatch = handshake.mismatch(self._identity, greeting.identity)
+        mismatch = authentication.version_mismatch(self._identity, greeting.identity)
         if mismatch is not None:
             raise fresh(mismatch)
-        if isinstance(greeting, Welcome):
+        if isinstance(greeting, MasterWelcome):
             if greeting.epoch < self.epoch:
                 raise LinkError(
                     f"the master at {self._address} is that of epoch {greeting.epoch}, and this "
@@ -207,20 +217,18 @@ class AgentDialer:
                     "taken the pool. End the earlier one"
                 )
             return greeting
-        reason = greeting.reason if isinstance(greeting, Refusal) else "it is an agent itself"
+        reason = greeting.reason if isinstance(greeting, MasterRefusal) else "it is an agent itself"
         raise LinkError(f"the master at {self._address} refused this agent: {reason}")
 
-    def _welcomed(self, welcome: Welcome, descriptor: int, secrets: Secrets) -> None:
+    def _welcomed(self, welcome: MasterWelcome, descriptor: int, secrets: Secrets) -> None:
         link = self._link
         if link is None:
             # An agent answers at all times; user code in the master may hold the interpreter long.
             lost_after = _LONGER * welcome.lost_after
             keepalive = Keepalive(welcome.heartbeat, welcome.suspect_after, lost_after)
-            link = ResumableLink(
-                self._loop, welcome.identity, keepalive, lambda _: self._stop(), dials=True
-            )
+            link = Link(self._loop, welcome.identity, keepalive, lambda _: self._stop(), dials=True)
         try:
-            connection = Connection(
+            connection = SealedConnection(
                 self._loop, descriptor, secrets, on_datagram=link.datagram, on_gone=self._gone
             )
         except FiberError as error:
@@ -235,7 +243,7 @@ class AgentDialer:
             self._link = link
             self._on_link(link)
 
-    def _gone(self, wire: Wire) -> None:
+    def _gone(self, wire: LinkConnection) -> None:
         if self._link is not None:
             self._link.disconnected(wire)
         self._start(_PAUSE_MIN)
@@ -288,16 +296,16 @@ class AgentDialer:
 
 
 def _connect(address: str) -> socket.socket:
-    """A connection; Unreachable, soon, if none can be made at this moment."""
+    """A connection; MasterUnreachable, soon, if none can be made at this moment."""
     try:
         sock = connect(parse_addresses(address), _CONNECT)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     except TimeoutError as error:
-        raise Unreachable(f"no answer within {_CONNECT:g} s") from error
+        raise MasterUnreachable(f"no answer within {_CONNECT:g} s") from error
     except OSError as error:
-        raise Unreachable(str(error.strerror or error).lower()) from error
+        raise MasterUnreachable(str(error.strerror or error).lower()) from error
     except UnicodeError as error:
-        raise Unreachable(f"its name is none: {error}") from error
+        raise MasterUnreachable(f"its name is none: {error}") from error
     return sock
 
 

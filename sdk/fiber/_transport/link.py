@@ -2,7 +2,7 @@
 
 A link carries frames both ways, each once and in order, also when the connection under it breaks
 and is replaced.  It ends when one side closes it, or after too long a silence, and stays ended.
-``ResumableLink`` is the implementation: a stream, the loop that drives it, and the present
+``Link`` is the implementation: a stream, the loop that drives it, and the present
 connection. Its ``send``, ``close`` and ``attach`` may be called from any thread; they only leave a
 note for the loop. Everything else runs on the loop thread.  The transport under the link
 (``listener``, ``dialer``, ``memory``) calls ``connected``, ``disconnected``, ``datagram`` and
@@ -15,19 +15,20 @@ import enum
 from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 from fiber import _logs
-from fiber._transport.handshake import Identity
-from fiber._transport.stream import (
+from fiber._transport.authentication import Identity
+from fiber._transport.link_protocol import (
     HEARTBEAT,
     Datagram,
     Frame,
     Gap,
     Lane,
-    ResumableStream,
-    Statistics,
+    LinkProtocol,
+    LinkStatistics,
 )
+from fiber._transport.loop import EventLoop, ScheduledCall
 from fiber._wire.memory_files import BytesLike
 from fiber._wire.messages import ProtocolError
 
@@ -62,43 +63,7 @@ class LinkObserver(Protocol):
         """Note that the link ended, and not by ``close`` on this side.  Called once, and last."""
 
 
-class Link(Protocol):
-    """End of a link.  Any thread may call its methods, and none blocks."""
-
-    peer: Identity
-
-    def attach(self, observer: LinkObserver) -> None:
-        """Set the observer.  Frames that arrived before wait for it."""
-
-    def send(
-        self, *frame: BytesLike, lane: Lane = None, on_left: Callable[[], None] | None = None
-    ) -> None:
-        """Send a frame as soon as there is room; dropped if the link has ended.
-
-        The frame may be given in pieces.  Large pieces are not copied, and must not change until
-        they have arrived.  Large frames of different lanes travel at the same time (``turns.py``
-        has the order).  ``on_left`` is called on the loop's thread when the connection has taken
-        the last piece.
-        """
-
-    def close(
-        self,
-        reason: str = "",
-        *,
-        linger: float = 1.0,
-        then: Callable[[], None] | None = None,
-    ) -> None:
-        """End the link.  The peer's observer gets ``on_lost(reason)``; this side's gets nothing.
-
-        Frames that were sent still arrive if that takes at most ``linger`` seconds.  ``then`` is
-        called on the loop's thread when the link has ended.
-        """
-
-    def statistics(self) -> Statistics:
-        """Return what the link holds now, and what it has done so far."""
-
-
-class Wire(Protocol):
+class LinkConnection(Protocol):
     """Connection under a link.  It keeps the order of datagrams until it breaks."""
 
     def put(self, datagram: Datagram) -> None:
@@ -111,37 +76,7 @@ class Wire(Protocol):
         """Close the connection."""
 
 
-class Timer(Protocol):
-    """Call that the loop makes later."""
-
-    def cancel(self) -> None:
-        """Cancel the call."""
-
-
-class EventLoop(Protocol):
-    """Part of the loop that a link needs: its clock and its turns."""
-
-    def now(self) -> float:
-        """Return the time in seconds of a monotonic clock."""
-
-    def call_soon(self, callback: Callable[..., None], *args: Any) -> None:
-        """Call ``callback`` on the loop's thread.  Any thread."""
-
-    def call_later(self, seconds: float, callback: Callable[..., None], *args: Any) -> Timer:
-        """Call ``callback`` once, after ``seconds``."""
-
-
-class SelectorEventLoop(EventLoop, Protocol):
-    """Loop that also watches descriptors."""
-
-    def register(self, fd: int, callback: Callable[[], None]) -> None:
-        """Call back whenever ``fd`` is readable."""
-
-    def unregister(self, fd: int) -> None:
-        """Stop watching ``fd``."""
-
-
-_BYE, _BYE_HEARD = b"\x20", b"\x21"
+_CLOSE, _CLOSE_ACK = b"\x20", b"\x21"
 
 _LAST_WORD = 0.2
 """Seconds for a farewell, or the answer to it, to leave before this side hangs up."""
@@ -151,7 +86,7 @@ _GRAIN = 0.001
 """Seconds that a timer takes at least.  Rounding could make a shorter one fire early for ever."""
 
 
-class _State(enum.Enum):
+class _LinkState(enum.Enum):
     OPEN = enum.auto()
     CLOSING = enum.auto()
     """Closed by this side.  Queued frames still leave."""
@@ -160,15 +95,15 @@ class _State(enum.Enum):
     ENDED = enum.auto()
 
 
-class ResumableLink:
-    """Link over one wire after the other; a ``Link``."""
+class Link:
+    """Link over one connection after the other; a ``Link``."""
 
     def __init__(
         self,
         loop: EventLoop,
         peer: Identity,
         keepalive: Keepalive,
-        on_end: Callable[[ResumableLink], None],
+        on_end: Callable[[Link], None],
         *,
         dials: bool = False,
     ) -> None:
@@ -178,33 +113,33 @@ class ResumableLink:
         self._keepalive = keepalive
         self._on_end = on_end
         self._dials = dials
-        self._stream = ResumableStream(loop.now(), heartbeat=keepalive.heartbeat)
-        self._state = _State.OPEN
-        self._wire: Wire | None = None
+        self._protocol = LinkProtocol(loop.now(), heartbeat=keepalive.heartbeat)
+        self._state = _LinkState.OPEN
+        self._connection: LinkConnection | None = None
         self._suspect = False
         self._observer: LinkObserver | None = None
         self._inbox: deque[Frame] = deque()
         self._lost: str | None = None
         self._flush_due = False
-        self._timer: Timer | None = None
+        self._timer: ScheduledCall | None = None
         self._timer_due = 0.0
-        self._farewell = b""
+        self._close_datagram = b""
         self._then: list[Callable[[], None]] = []
 
     @property
     def arrived(self) -> int:
         """Number of the peer's datagrams that have arrived, for the handshake."""
-        return self._stream.arrived
+        return self._protocol.arrived
 
     @property
     def is_connected(self) -> bool:
         """True while there is a connection."""
-        return self._wire is not None
+        return self._connection is not None
 
     @property
     def heard(self) -> bool:
         """True if the peer has ever sent anything."""
-        return self._stream.heard
+        return self._protocol.heard
 
     def attach(self, observer: LinkObserver) -> None:
         """Set the observer.  Frames that arrived before wait for it."""
@@ -228,75 +163,75 @@ class ResumableLink:
         self._observer = None
         self._loop.call_soon(self._close, reason, linger, then)
 
-    def statistics(self) -> Statistics:
+    def statistics(self) -> LinkStatistics:
         """Return what the link holds now, and what it has done so far."""
-        return self._stream.statistics()
+        return self._protocol.statistics()
 
-    def connected(self, wire: Wire, arrived: int) -> None:
-        """Go on over ``wire``, whose other end has ``arrived`` of our datagrams."""
-        if self._state is _State.ENDED:
-            wire.close()
+    def connected(self, connection: LinkConnection, arrived: int) -> None:
+        """Go on over ``connection``, whose other end has ``arrived`` of our datagrams."""
+        if self._state is _LinkState.ENDED:
+            connection.close()
             return
-        if self._wire is not None:
+        if self._connection is not None:
             self._unplug().close()
         try:
-            self._stream.connected(arrived)
+            self._protocol.connected(arrived)
         except ProtocolError as error:
             # A peer that forgot what it had acknowledged is not the one that this link was with.
-            wire.close()
+            connection.close()
             self._lose(str(error))
             return
         _logs.debug("link with %s: connected", self.peer.name)
-        self._wire = wire
+        self._connection = connection
         self._flush()
 
     def disconnect(self) -> None:
-        """Close the wire.  The peer has closed it, or dials again once it notices."""
-        if self._wire is not None:
+        """Close the connection.  The peer has closed it, or dials again once it notices."""
+        if self._connection is not None:
             self._unplug().close()
 
-    def disconnected(self, wire: Wire) -> None:
-        """Note that ``wire`` broke.  A wire that was replaced before does not matter."""
-        if wire is not self._wire:
+    def disconnected(self, connection: LinkConnection) -> None:
+        """Note that ``connection`` broke; ignore a connection that was replaced before."""
+        if connection is not self._connection:
             return
         _logs.debug("link with %s: the connection ended", self.peer.name)
         self._unplug()
-        if self._state is _State.LEAVING:
+        if self._state is _LinkState.LEAVING:
             self._end()
 
-    def datagram(self, wire: Wire, datagram: BytesLike) -> None:
-        """Take a datagram from ``wire`` without keeping it; ignore a wire that was replaced."""
-        if wire is not self._wire or self._state is _State.ENDED:
+    def datagram(self, connection: LinkConnection, datagram: BytesLike) -> None:
+        """Take a datagram without keeping it; ignore one from a connection that was replaced."""
+        if connection is not self._connection or self._state is _LinkState.ENDED:
             return
-        if datagram[:1] == _BYE:
-            wire.put(_BYE_HEARD)
+        if datagram[:1] == _CLOSE:
+            connection.put(_CLOSE_ACK)
             self._lose(str(datagram[1:], "utf-8", "replace") or "it closed the link", hang_up=False)
-        elif datagram == _BYE_HEARD:
-            if self._state is _State.LEAVING:
+        elif datagram == _CLOSE_ACK:
+            if self._state is _LinkState.LEAVING:
                 self._end()
         else:
-            self._take(wire, datagram)
+            self._take(connection, datagram)
 
     def refused(self, reason: str) -> None:
         """End the link, which the peer does not continue."""
         self._lose(reason)
 
-    def _take(self, wire: Wire, datagram: BytesLike) -> None:
+    def _take(self, connection: LinkConnection, datagram: BytesLike) -> None:
         now = self._loop.now()
         try:
-            frames = self._stream.received(datagram, now)
+            frames = self._protocol.received(datagram, now)
         except Gap:
-            wire.break_off()
+            connection.break_off()
             return
         except ProtocolError as error:
             # Past this point nothing that it says can be relied upon.
             self._lose(f"it broke the protocol: {error}")
             return
-        if self._state is _State.OPEN:
+        if self._state is _LinkState.OPEN:
             self._inbox += frames
         self._heard()
         self._hand_over()
-        if self._state is not _State.OPEN or self._stream.wants_to_speak(now):
+        if self._state is not _LinkState.OPEN or self._protocol.wants_to_speak(now):
             self._flush_soon()
         elif not self._flush_due:
             self._set_timer(now)
@@ -326,9 +261,9 @@ class ResumableLink:
     def _send(
         self, frame: Sequence[BytesLike], lane: Lane, on_left: Callable[[], None] | None
     ) -> None:
-        if self._state is not _State.ENDED:
+        if self._state is not _LinkState.ENDED:
             told = None if on_left is None else partial(self._loop.call_soon, on_left)
-            self._stream.send(*frame, lane=lane, on_left=told)
+            self._protocol.send(*frame, lane=lane, on_left=told)
             self._flush_soon()
 
     def _flush_soon(self) -> None:
@@ -339,22 +274,22 @@ class ResumableLink:
 
     def _flush(self) -> None:
         self._flush_due = False
-        if self._state is not _State.ENDED:
+        if self._state is not _LinkState.ENDED:
             self._speak()
 
     def _speak(self) -> None:
         now = self._loop.now()
-        if self._wire is not None:
-            for datagram in self._stream.outgoing(now):
-                self._wire.put(datagram)
-            if self._state is _State.CLOSING and self._stream.idle:
-                self._state = _State.LEAVING
-                self._wire.put(self._farewell)
+        if self._connection is not None:
+            for datagram in self._protocol.outgoing(now):
+                self._connection.put(datagram)
+            if self._state is _LinkState.CLOSING and self._protocol.idle:
+                self._state = _LinkState.LEAVING
+                self._connection.put(self._close_datagram)
         self._set_timer(now)
 
     def _set_timer(self, now: float) -> None:
         """Set the timer.  A timer that fires too early only looks again."""
-        due = self._stream.next_timer()
+        due = self._protocol.next_timer()
         if self._timer is not None:
             if self._timer_due <= due:
                 return
@@ -364,52 +299,52 @@ class ResumableLink:
 
     def _tick(self) -> None:
         self._timer = None
-        silent = self._stream.tick(self._loop.now())
+        silent = self._protocol.tick(self._loop.now())
         if silent >= self._keepalive.lost_after:
-            broken = "" if self._wire else "the connection broke, and "
+            broken = "" if self._connection else "the connection broke, and "
             self._lose(f"{broken}nothing was heard for {silent:.0f} s")
             return
         if silent >= self._keepalive.suspect_after and not self._suspect:
             self._suspect = True
-            if self._wire is not None and self._dials:
-                self._wire.break_off()
+            if self._connection is not None and self._dials:
+                self._connection.break_off()
             if observer := self._observer:
                 observer.on_suspect()
         self._speak()
 
-    def _unplug(self) -> Wire:
-        wire, self._wire = self._wire, None
-        assert wire is not None
-        self._stream.disconnected()
-        return wire
+    def _unplug(self) -> LinkConnection:
+        connection, self._connection = self._connection, None
+        assert connection is not None
+        self._protocol.disconnected()
+        return connection
 
     def _close(self, reason: str, linger: float, then: Callable[[], None] | None) -> None:
         if then is not None:
             self._then.append(then)
         self._inbox.clear()
-        if self._state is _State.ENDED:
+        if self._state is _LinkState.ENDED:
             self._finished()
-        elif self._state is _State.OPEN:
-            self._state = _State.CLOSING
-            self._farewell = _BYE + reason.encode("utf-8", "replace")
+        elif self._state is _LinkState.OPEN:
+            self._state = _LinkState.CLOSING
+            self._close_datagram = _CLOSE + reason.encode("utf-8", "replace")
             self._loop.call_later(linger, self._give_up)
             self._flush()
 
     def _give_up(self) -> None:
         """End the link after its linger, with or without the peer's answer."""
-        if self._state is _State.ENDED:
+        if self._state is _LinkState.ENDED:
             return
-        if self._state is _State.CLOSING and self._wire is not None:
-            self._wire.put(self._farewell)
-            self._state = _State.LEAVING
+        if self._state is _LinkState.CLOSING and self._connection is not None:
+            self._connection.put(self._close_datagram)
+            self._state = _LinkState.LEAVING
             self._loop.call_later(_LAST_WORD, self._give_up)
         else:
             self._end()
 
     def _lose(self, reason: str, *, hang_up: bool = True) -> None:
-        if self._state is _State.ENDED:
+        if self._state is _LinkState.ENDED:
             return
-        if self._state is _State.OPEN:
+        if self._state is _LinkState.OPEN:
             self._lost = reason
         if hang_up:
             self._end()
@@ -419,16 +354,16 @@ class ResumableLink:
         self._hand_over()
 
     def _stop(self) -> None:
-        self._state = _State.ENDED
+        self._state = _LinkState.ENDED
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
 
     def _end(self) -> None:
         self._stop()
-        if self._wire is not None:
+        if self._connection is not None:
             self._unplug().close()
-        self._stream.end()
+        self._protocol.end()
         self._on_end(self)
         self._finished()
 

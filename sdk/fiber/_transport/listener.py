@@ -6,19 +6,19 @@ import os
 import socket
 from collections.abc import Callable
 
-from fiber._transport import handshake
+from fiber._transport import authentication
 from fiber._transport.acceptor import MASTER, Acceptor, PendingConnection, ServedPool
-from fiber._transport.credentials import MasterCredentials
-from fiber._transport.handshake import Hello, Identity, Refusal, Welcome
-from fiber._transport.link import (
-    DEFAULT_KEEPALIVE,
-    Keepalive,
-    Link,
-    ResumableLink,
-    SelectorEventLoop,
+from fiber._transport.authentication import (
+    AgentHello,
+    Identity,
+    MasterRefusal,
+    MasterWelcome,
+    Secrets,
 )
-from fiber._transport.nng import Connection
-from fiber._transport.sealing import Secrets
+from fiber._transport.credentials import MasterCredentials
+from fiber._transport.link import DEFAULT_KEEPALIVE, Keepalive, Link
+from fiber._transport.loop import Loop
+from fiber._transport.nng import SealedConnection
 from fiber.errors import FiberError
 
 
@@ -41,7 +41,7 @@ class MasterListener:
 
     def __init__(
         self,
-        loop: SelectorEventLoop,
+        loop: Loop,
         at: Acceptor | str,
         credentials: MasterCredentials,
         *,
@@ -58,12 +58,12 @@ class MasterListener:
         self._knows = objection
         self.epoch = 0
         """Number of this master among those of the pool.  On the loop's thread."""
-        self._waiting: dict[tuple[str, str], tuple[PendingConnection, Hello]] = {}
-        self._by_peer: dict[tuple[str, str], ResumableLink] = {}
+        self._waiting: dict[tuple[str, str], tuple[PendingConnection, AgentHello]] = {}
+        self._by_peer: dict[tuple[str, str], Link] = {}
         self._keepalive = keepalive
         self._lost_grace = lost_grace
         self._identity = Identity.of_this_process(MASTER)
-        self._links: dict[str, ResumableLink] = {}
+        self._links: dict[str, Link] = {}
         self._closing: list[Callable[[], None]] | None = None
         self._shares = isinstance(at, Acceptor)
         self._acceptor = at if isinstance(at, Acceptor) else Acceptor(at, credentials.certificate)
@@ -130,11 +130,11 @@ class MasterListener:
             if not pending.gone:
                 self._greet(pending, hello)
 
-    def _proven(self, pending: PendingConnection, hello: Hello) -> None:
+    def _proven(self, pending: PendingConnection, hello: AgentHello) -> None:
         self._on_proven()
         self._greet(pending, hello)
 
-    def _greet(self, pending: PendingConnection, hello: Hello) -> None:
+    def _greet(self, pending: PendingConnection, hello: AgentHello) -> None:
         """Answer an agent that has proved its name and uid."""
         reason = self._objection(hello)
         if reason is None:
@@ -144,15 +144,15 @@ class MasterListener:
         else:
             self._welcome(pending, hello)
 
-    def _let_wait(self, pending: PendingConnection, hello: Hello) -> None:
+    def _let_wait(self, pending: PendingConnection, hello: AgentHello) -> None:
         peer = _peer(hello.identity)
         if before := self._waiting.pop(peer, None):
             before[0].drop()  # the same agent has dialled again
         pending.waits_for(f"there is no pod {hello.identity.name!r} yet")
         self._waiting[peer] = pending, hello
 
-    def _objection(self, hello: Hello) -> str | None:
-        error = handshake.mismatch(self._identity, hello.identity)
+    def _objection(self, hello: AgentHello) -> str | None:
+        error = authentication.version_mismatch(self._identity, hello.identity)
         if error is not None:
             return str(error)
         if self._closing is not None:
@@ -174,15 +174,17 @@ class MasterListener:
         return self._knows(hello.identity)
 
     def _refuse(self, pending: PendingConnection, reason: str) -> None:
-        pending.turn_away(Refusal(self._identity, reason).encode(), reason)
+        pending.turn_away(MasterRefusal(self._identity, reason).encode(), reason)
 
-    def _welcome(self, pending: PendingConnection, hello: Hello) -> None:
+    def _welcome(self, pending: PendingConnection, hello: AgentHello) -> None:
         link = self._links.get(hello.link)
         if link is not None:
             # The welcome says how much has arrived.  The old connection must bring nothing more.
             link.disconnect()
         arrived = link.arrived if link else 0
-        welcome = Welcome(self._identity, arrived, *self._keepalive, self._lost_grace, self.epoch)
+        welcome = MasterWelcome(
+            self._identity, arrived, *self._keepalive, self._lost_grace, self.epoch
+        )
         pending.welcome(
             welcome.encode(),
             lambda descriptor, secrets: self._loop.call_soon(
@@ -193,7 +195,7 @@ class MasterListener:
     def _connect(
         self,
         pending: PendingConnection,
-        hello: Hello,
+        hello: AgentHello,
         arrived: int,
         descriptor: int,
         secrets: Secrets,
@@ -209,12 +211,12 @@ class MasterListener:
             return
         new = link is None
         if link is None:
-            link = ResumableLink(
+            link = Link(
                 self._loop, hello.identity, self._keepalive, lambda _: self._forget(hello.link)
             )
             self._by_peer[_peer(hello.identity)] = link
         try:
-            connection = Connection(
+            connection = SealedConnection(
                 self._loop,
                 descriptor,
                 secrets,

@@ -57,7 +57,29 @@ class Dependent(Protocol):
         """Note that the loop has failed and brings nothing.  Called once, on the loop's thread."""
 
 
-class Timer:
+class ScheduledCall(Protocol):
+    """Call that the loop makes later."""
+
+    def cancel(self) -> None:
+        """Cancel the call."""
+
+
+class EventLoop(Protocol):
+    """Part of the loop that a link needs: its clock and its turns."""
+
+    def now(self) -> float:
+        """Return the time in seconds of a monotonic clock."""
+
+    def call_soon(self, callback: Callable[..., None], *args: Any) -> None:
+        """Call ``callback`` on the loop's thread.  Any thread."""
+
+    def call_later(
+        self, seconds: float, callback: Callable[..., None], *args: Any
+    ) -> ScheduledCall:
+        """Call ``callback`` once, after ``seconds``."""
+
+
+class LoopTimer:
     """Call that the loop makes later, unless it is cancelled."""
 
     __slots__ = ("callback", "due")
@@ -103,7 +125,7 @@ class Loop:
         self._writers: dict[int, Callback] = {}
         self._paused: set[int] = set()
         self._ready: deque[tuple[Callable[..., object], tuple[Any, ...]]] = deque()
-        self._timers: list[tuple[float, int, Timer]] = []
+        self._timers: list[tuple[float, int, LoopTimer]] = []
         self._sequence = itertools.count()
         self._sweep_at = _MANY_TIMERS
         self._dependents: weakref.WeakSet[Dependent] = weakref.WeakSet()
@@ -156,9 +178,9 @@ class Loop:
         if self._asleep and wakeup is not None:
             wakeup.set()
 
-    def call_later(self, seconds: float, callback: Callable[..., object], *args: Any) -> Timer:
+    def call_later(self, seconds: float, callback: Callable[..., object], *args: Any) -> LoopTimer:
         """Call ``callback`` once, ``seconds`` from now, on the loop's thread."""
-        timer = Timer(self.now() + seconds, partial(callback, *args) if args else callback)
+        timer = LoopTimer(self.now() + seconds, partial(callback, *args) if args else callback)
         if self.on_thread():
             self._add_timer(timer)
         else:
@@ -294,7 +316,7 @@ class Loop:
             if timer.callback is not None:
                 _call(timer.callback)
 
-    def _add_timer(self, timer: Timer) -> None:
+    def _add_timer(self, timer: LoopTimer) -> None:
         if len(self._timers) >= self._sweep_at:
             # Those that were cancelled long before their time would pile up.
             self._timers = [entry for entry in self._timers if entry[2].callback is not None]

@@ -14,6 +14,12 @@ Facts about nng, and what follows from them:
 * A socket does not survive a fork: in the child it is made harmless, not closed.
 * pynng copies a message twice on its way; here it is sealed right into nng's memory, and opened
   right out of it.
+
+Messages are sealed by AES-256-GCM under a counter, with one key for each direction.  The counter is
+not sent: both sides count.  A message that was changed, repeated or moved on the way does not open,
+and neither does any message after it.  The same holds if a message was left out.  A key serves for
+a bounded number of messages and bytes.  Then its successor is derived from it, and the key is
+forgotten.
 """
 
 from __future__ import annotations
@@ -22,6 +28,7 @@ import atexit
 import contextlib
 import os
 import socket
+import threading
 import time
 import weakref
 from collections.abc import Callable
@@ -29,14 +36,27 @@ from multiprocessing import util
 from typing import Any
 
 import pynng
+from cryptography.exceptions import InvalidTag
+from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 from pynng import _nng
 
-from fiber._transport.link import SelectorEventLoop, Wire
-from fiber._transport.sealing import OVERHEAD, Opener, Sealer, Secrets
-from fiber._transport.stream import LARGEST, WINDOW, Datagram
-from fiber._transport.unix import naming_the_limit
+from fiber._transport.authentication import Secrets, expand
+from fiber._transport.channels import naming_the_limit
+from fiber._transport.link import LinkConnection
+from fiber._transport.link_protocol import LARGEST, WINDOW, Datagram
+from fiber._transport.loop import Loop
+from fiber._wire.memory_files import BytesLike
 from fiber._wire.messages import ProtocolError
 from fiber.errors import LinkError, TooManyOpenFiles
+
+OVERHEAD = 16
+"""Bytes by which a sealed message is longer."""
+
+MESSAGES_PER_KEY = 1 << 20
+BYTES_PER_KEY = 1 << 36
+"""Well below what GCM bears: TLS 1.3 stops at about 2**38 bytes (RFC 8446, 5.5)."""
+
+_NONCE = 12
 
 _TURN = 64
 """Messages taken in one turn of the loop.  Then other descriptors get their turn."""
@@ -53,20 +73,106 @@ _NOTICES = 1.0
 _lib, _ffi = _nng.lib, _nng.ffi
 
 
-class Connection:
-    """Connection over nng; a ``Wire``.  Its callbacks run on the loop's thread.
+class Sealer:
+    """The sending side."""
+
+    def __init__(
+        self, secret: bytes, messages: int = MESSAGES_PER_KEY, size: int = BYTES_PER_KEY
+    ) -> None:
+        self._keys = _Keys(secret, messages, size)
+
+    def seal_into(self, data: BytesLike, sealed: BytesLike) -> None:
+        """Write ``data`` sealed to ``sealed``, which is OVERHEAD bytes longer."""
+        cipher, nonce = self._keys.next(len(data))
+        cipher.encrypt_into(nonce, data, None, sealed)
+
+
+class _OpenedMessage(threading.local):
+    """Memory for the message that a thread has just opened.
+
+    All connections share it.  So it stays in the processor's cache and needs no zeroing, and a
+    thousand connections take no more memory than one.
+    """
+
+    def __init__(self) -> None:
+        self.view = memoryview(bytearray())
+
+    def of(self, size: int) -> memoryview:
+        """Return ``size`` bytes of the memory."""
+        if size > len(self.view):
+            self.view = memoryview(bytearray(size))
+        return self.view[:size]
+
+
+_opened = _OpenedMessage()
+
+
+class Opener:
+    """The receiving side."""
+
+    def __init__(
+        self, secret: bytes, messages: int = MESSAGES_PER_KEY, size: int = BYTES_PER_KEY
+    ) -> None:
+        self._keys = _Keys(secret, messages, size)
+
+    def open(self, sealed: BytesLike) -> memoryview:
+        """Return the next message; ProtocolError if ``sealed`` is not that message.
+
+        The caller must use it before this thread opens another message, of any connection.
+        """
+        size = len(sealed) - OVERHEAD
+        if size < 0:
+            raise ProtocolError(f"a sealed message cannot have {len(sealed)} bytes")
+        cipher, nonce = self._keys.next(size)
+        data = _opened.of(size)
+        try:
+            cipher.decrypt_into(nonce, sealed, None, data)
+        except InvalidTag:
+            raise ProtocolError(
+                f"a sealed message of {len(sealed)} bytes does not open: it was changed on the "
+                "way, or is not the one that comes next"
+            ) from None
+        return data
+
+
+class _Keys:
+    """Sequence of keys, each with its counter.  Both sides change the key at the same message."""
+
+    def __init__(self, secret: bytes, messages: int, size: int) -> None:
+        self._messages = messages
+        self._size = size
+        self._begin(secret)
+
+    def next(self, size: int) -> tuple[AESGCM, bytes]:
+        """Return key and nonce for the next message, which has ``size`` bytes."""
+        if self._count == self._messages or self._used + size > self._size:
+            self._begin(self._successor)
+        nonce = self._count.to_bytes(_NONCE, "big")
+        self._count += 1
+        self._used += size
+        return self._cipher, nonce
+
+    def _begin(self, secret: bytes) -> None:
+        self._cipher = AESGCM(expand(secret, b"key"))
+        self._successor = expand(secret, b"next")
+        self._count = 0
+        self._used = 0
+
+
+class SealedConnection:
+    """Connection over nng; a ``LinkConnection``.  Its callbacks run on the loop's thread.
 
     ``on_gone`` is called once when the connection breaks, and not after ``close``.
     """
 
     def __init__(
         self,
-        loop: SelectorEventLoop,
+        loop: Loop,
         descriptor: int,
         secrets: Secrets,
         *,
-        on_datagram: Callable[[Wire, memoryview], None],
-        on_gone: Callable[[Wire], None],
+        on_datagram: Callable[[LinkConnection, memoryview], None],
+        on_gone: Callable[[LinkConnection], None],
     ) -> None:
         """Take over ``descriptor``, also if an error is raised."""
         self._loop = loop
@@ -214,7 +320,7 @@ def _pair(
     return pair, readable
 
 
-_live: weakref.WeakSet[Connection] = weakref.WeakSet()
+_live: weakref.WeakSet[SealedConnection] = weakref.WeakSet()
 
 
 def _after_fork_in_child() -> None:

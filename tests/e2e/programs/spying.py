@@ -24,8 +24,8 @@ from pathlib import Path
 from typing import TypeVar
 
 import fiber
+from fiber._transport.authentication import Identity
 from fiber._transport.credentials import MasterCredentials
-from fiber._transport.handshake import Identity
 
 T = TypeVar("T")
 DISGUISE = bytes(byte ^ 0x5A for byte in range(256))

@@ -18,9 +18,9 @@ from fiber._backends.output import Output
 from fiber._backends.remote import RemoteAgent, RemoteChild
 from fiber._engine.placement import Demand, Placement
 from fiber._hub.hub import Hub
-from fiber._transport.handshake import Identity
+from fiber._transport.authentication import Identity
 from fiber._transport.link import Link
-from fiber._transport.loop import Loop, Timer
+from fiber._transport.loop import Loop, LoopTimer
 from fiber.config import Config
 from fiber.errors import FiberError, FiberPoolError
 from fiber_api import names
@@ -81,7 +81,7 @@ class Pods:
         self._closing = threading.Event()
         """Set once the API server is asked for nothing but the end."""
         self._decision_is_due = False
-        self._timer: Timer | None = None
+        self._timer: LoopTimer | None = None
         self._wanted = 0
         self._pods: dict[str, Document] = {}
         self._given_up: set[str] = set()

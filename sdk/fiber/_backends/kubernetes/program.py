@@ -33,8 +33,8 @@ from fiber._backends.kubernetes.template import (
     secrets_left_out,
 )
 from fiber._transport.acceptor import Acceptor
+from fiber._transport.authentication import Identity
 from fiber._transport.credentials import MasterCredentials, make_certificate, make_credentials
-from fiber._transport.handshake import Identity
 from fiber._transport.link import Keepalive, Link
 from fiber._transport.listener import MasterListener
 from fiber._transport.loop import Loop

@@ -31,8 +31,7 @@ from fiber._backends.kubernetes.problems import (
 )
 from fiber._backends.kubernetes.program import PreparedPool
 from fiber._backends.output import Output
-from fiber._transport.link import EventLoop, Timer
-from fiber._transport.loop import Loop
+from fiber._transport.loop import EventLoop, Loop, ScheduledCall
 from fiber.errors import FiberError
 
 
@@ -65,11 +64,11 @@ class Waiting:
         self._placement = agents.placement
         self._timeout = timeout
         self._on_begin = on_begin
-        self._patience: Timer | None = None
+        self._patience: ScheduledCall | None = None
         self._reachability = Reachability()
         self._verdict = Verdict.OPEN
         self._told_of_verdict = False
-        self._next_judgement: Timer | None = None
+        self._next_judgement: ScheduledCall | None = None
         self._told_of_limit = False
         self._progress = Progress(agents.loop, output, self._describe)
 
@@ -237,7 +236,7 @@ class Progress:
         self._loop = loop
         self._output = output
         self._describe = describe
-        self._timer: Timer | None = None
+        self._timer: ScheduledCall | None = None
         self._shows = False
 
     def start(self) -> None:

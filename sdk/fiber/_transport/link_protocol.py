@@ -59,7 +59,7 @@ Lane: TypeAlias = Hashable | None
 Pieces: TypeAlias = Sequence[BytesLike]
 
 
-class Entry(NamedTuple):
+class FramePiece(NamedTuple):
     """A frame, or a piece of one, in a datagram."""
 
     word: int
@@ -81,7 +81,7 @@ class _Waiting:
         """Number of frames of the first queue that go before this one."""
 
 
-class Turns:
+class SendQueue:
     """Frames that wait.  ``budget``: bytes of a datagram's entries, with their words."""
 
     def __init__(self, budget: int) -> None:
@@ -118,18 +118,18 @@ class Turns:
         self._lanes.clear()
         self.bytes = 0
 
-    def take(self) -> list[Entry]:
+    def take(self) -> list[FramePiece]:
         """Take out what goes into the next datagram."""
-        entries: list[Entry] = []
+        entries: list[FramePiece] = []
         # Large frames go on, however many small ones come.
         room = self._fill(entries, self._budget, self._budget // 2 if self._lanes else 0)
         while self._lanes and (not entries or room >= self._budget // 4):
-            lane = self._whose_turn()
+            lane = self._next_lane()
             if lane is None:
                 break
-            line = self._lanes[lane]
-            room = self._piece(entries, line[0], room)
-            if not line[0].left:
+            waiting_in_lane = self._lanes[lane]
+            room = self._piece(entries, waiting_in_lane[0], room)
+            if not waiting_in_lane[0].left:
                 self._next_of(lane)
         return entries
 
@@ -140,13 +140,15 @@ class Turns:
         self._first.append(waiting)
         self._added += 1
 
-    def _fill(self, entries: list[Entry], room: int, reserved: int) -> int:
+    def _fill(self, entries: list[FramePiece], room: int, reserved: int) -> int:
         """Take from the first queue while more than ``reserved`` bytes of room are left."""
         first = self._first
         while first and room > reserved:
             waiting = first[0]
             if waiting.slot is None and waiting.size + WORD <= room:
-                entries.append(Entry(FIRST | LAST | waiting.size, waiting.pieces, waiting.size))
+                entries.append(
+                    FramePiece(FIRST | LAST | waiting.size, waiting.pieces, waiting.size)
+                )
                 room -= waiting.size + WORD
                 self.bytes -= waiting.size
                 waiting.left = 0
@@ -162,11 +164,11 @@ class Turns:
             self._gone += 1
         return room
 
-    def _whose_turn(self) -> Lane:
+    def _next_lane(self) -> Lane:
         for _ in range(len(self._lanes)):
             lane = next(iter(self._lanes))
-            line = self._lanes[lane] = self._lanes.pop(lane)
-            if line[0].after <= self._gone and self._claim_slot(line[0]):
+            waiting_in_lane = self._lanes[lane] = self._lanes.pop(lane)
+            if waiting_in_lane[0].after <= self._gone and self._claim_slot(waiting_in_lane[0]):
                 return lane
         return None
 
@@ -175,7 +177,7 @@ class Turns:
             waiting.slot = self._slots.pop()
         return waiting.slot is not None
 
-    def _piece(self, entries: list[Entry], waiting: _Waiting, room: int) -> int:
+    def _piece(self, entries: list[FramePiece], waiting: _Waiting, room: int) -> int:
         """Take the next piece of a frame that has a slot."""
         assert waiting.slot is not None
         word = waiting.slot << SLOT_SHIFT
@@ -195,17 +197,17 @@ class Turns:
             if waiting.on_left is not None:
                 waiting.on_left()
         length = size + (SIZE.size if head else 0)
-        entries.append(Entry(word | length, (*head, *taken), length))
+        entries.append(FramePiece(word | length, (*head, *taken), length))
         return room - size
 
     def _next_of(self, lane: Lane) -> None:
         """The large frame at the head of a lane has left."""
-        line = self._lanes[lane]
-        line.popleft()
-        while line and self._is_small(line[0]):
-            self._append(line.popleft())
-        if line:
-            line[0].after = self._added
+        waiting_in_lane = self._lanes[lane]
+        waiting_in_lane.popleft()
+        while waiting_in_lane and self._is_small(waiting_in_lane[0]):
+            self._append(waiting_in_lane.popleft())
+        if waiting_in_lane:
+            waiting_in_lane[0].after = self._added
         else:
             del self._lanes[lane]
 
@@ -253,7 +255,7 @@ class Gap(ProtocolError):
     """The connection has lost a datagram, and must be given up."""
 
 
-class Statistics(NamedTuple):
+class LinkStatistics(NamedTuple):
     """Counts of what a stream holds now, and of what it has done so far."""
 
     queued_frames: int
@@ -273,7 +275,7 @@ class Statistics(NamedTuple):
     breaks: int
 
 
-class ResumableStream:
+class LinkProtocol:
     """End of a stream.  It begins without a connection."""
 
     def __init__(
@@ -290,7 +292,7 @@ class ResumableStream:
         self._window = window
         self._window_bytes = window_bytes
         self._connected = False
-        self._turns = Turns(budget)
+        self._queue = SendQueue(budget)
         self._sent = 0
         self._acknowledged = 0
         self._unacknowledged: deque[Datagram] = deque()
@@ -306,12 +308,12 @@ class ResumableStream:
         self._last_sent = self._ticked = now
         self._speak_now = False
         self._silent = 0.0
-        self._counts = dict.fromkeys(Statistics._fields[5:], 0)
+        self._counts = dict.fromkeys(LinkStatistics._fields[5:], 0)
 
     @property
     def idle(self) -> bool:
         """True if all frames are known to have arrived."""
-        return not self._turns and not self._unacknowledged
+        return not self._queue and not self._unacknowledged
 
     @property
     def arrived(self) -> int:
@@ -331,7 +333,7 @@ class ResumableStream:
         ``on_left`` is called when the last of it goes out for the first time.  No piece may change
         until it has left, nor one from LARGE bytes on until ``idle``.
         """
-        self._turns.add(frame, lane, on_left)
+        self._queue.add(frame, lane, on_left)
         self._counts["frames_sent"] += 1
 
     def connected(self, arrived: int) -> None:
@@ -354,7 +356,7 @@ class ResumableStream:
 
     def end(self) -> None:
         """Forget the frames that have not arrived on either side."""
-        self._turns.clear()
+        self._queue.clear()
         self._unacknowledged.clear()
         self._unacknowledged_bytes = 0
         self._assemblies = [None] * SLOTS
@@ -436,11 +438,11 @@ class ResumableStream:
                 due = min(due, self._ack_due)
         return due
 
-    def statistics(self) -> Statistics:
+    def statistics(self) -> LinkStatistics:
         """Return what the stream holds now, and what it has done so far."""
-        return Statistics(
-            queued_frames=len(self._turns),
-            queued_bytes=self._turns.bytes,
+        return LinkStatistics(
+            queued_frames=len(self._queue),
+            queued_bytes=self._queue.bytes,
             unacknowledged_datagrams=len(self._unacknowledged),
             unacknowledged_bytes=self._unacknowledged_bytes,
             partial_bytes=sum(each.arrived for each in self._assemblies if each is not None),
@@ -449,7 +451,7 @@ class ResumableStream:
 
     def _may_send(self) -> bool:
         return (
-            bool(self._turns)
+            bool(self._queue)
             and len(self._unacknowledged) < self._window
             and self._unacknowledged_bytes < self._window_bytes
         )
@@ -465,7 +467,7 @@ class ResumableStream:
 
     def _pack(self) -> Datagram:
         """Make the next datagram."""
-        entries = self._turns.take()
+        entries = self._queue.take()
         count = len(entries)
         self._sent += 1
         head = _HEADER.pack(DATA, count, self._sent, self._received)

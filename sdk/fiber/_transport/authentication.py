@@ -6,40 +6,276 @@
       │◄─────────────────────────────────────────┤
       │                          32 random bytes │
       │◄─────────────────────────────────────────┤
-      │  32 random bytes, Hello, proof           │
-      ├─────────────────────────────────────────►│  believes it or not, takes it or not
+      │  32 random bytes, AgentHello, proof      │
+      ├─────────────────────────────────────────►│  checks the proof and the versions
       │◄─────────────────────────────────────────┤
-      │               Welcome or Refusal, proof  │
+      │    MasterWelcome or MasterRefusal, proof │
       │  end of TLS                              │
       ├─────────────────────────────────────────►│
       │◄─────────────────────────────────────────┤
       ▼  the same connection, without TLS        ▼
 
-A proof is an HMAC with the agent's own key, which the master derives, over the random bytes of
-both sides, the certificate that TLS has shown, and the words beside it.  So it is good for one
-connection with one master: who shows another certificate, in the middle say, passes no proof on.
+The greetings say who each side is and how many datagrams of the link have arrived.  So the same
+exchange begins a link and resumes it on a new connection.  A greeting is one byte for the kind, and
+JSON.  The fields of an identity are the same in every version, so that two sides that do not
+understand each other can still say why.
 
-Nothing here blocks or knows where its socket comes from: each side is a generator that yields the
-event (``select.POLLIN`` or ``POLLOUT``) for which it has to wait.  TLS works on the socket itself
-and not on buffers in memory, because what follows the end of TLS must stay in the socket.
+A proof is an HMAC with the agent's own key, which the master derives.  It covers the random bytes
+of both sides, the certificate that TLS has shown, and the greeting beside it.  So it is valid for
+one connection with one master.  A peer in the middle, which shows another certificate, cannot pass
+it on.
+
+Each side of the handshake is a generator: it yields the event (``select.POLLIN`` or ``POLLOUT``)
+for which it has to wait, and never blocks.  TLS works on the socket itself and not on buffers in
+memory, because the bytes that follow the end of TLS must stay in the socket.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import hmac
+import json
 import os
+import platform
 import select
 import socket
 import ssl
 import struct
-from collections.abc import Callable, Generator
-from typing import Any, TypeAlias, TypeVar
+from collections.abc import Callable, Generator, Mapping
+from importlib import metadata
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 from fiber._transport.credentials import Certificate, Credentials
-from fiber._transport.sealing import SECRET_SIZE, Secrets, derive
-from fiber._wire.messages import ProtocolError
-from fiber.errors import AuthenticationError
+from fiber._wire.messages import PROTOCOL, ProtocolError
+from fiber.errors import AuthenticationError, ConfigError, VersionMismatch
+
+_HELLO, _WELCOME, _REFUSAL = 0x10, 0x11, 0x12
+
+_LONGEST_NAME = 253
+"""Characters of the longest name that a pod can have.  Logs repeat what a stranger claims to be."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Identity:
+    """Identity of one side.  ``facts`` describe its host."""
+
+    name: str
+    protocol: int
+    python: str
+    fiber: str
+    facts: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    uid: str = ""
+    """Uid of the agent's pod.  An agent has proved to have this name and uid."""
+
+    @classmethod
+    def of_this_process(cls, name: str, uid: str = "", **facts: str) -> Identity:
+        """Return the identity of this interpreter and this Fiber, under ``name``."""
+        return cls(name, PROTOCOL, platform.python_version(), _fiber_version(), facts, uid)
+
+
+class AgentHello(NamedTuple):
+    """Greeting of an agent."""
+
+    identity: Identity
+    link: str
+    """Random name of the link.  A master that restarted takes it for no other link, and no other
+    agent can guess it."""
+    arrived: int
+    """Number of the master's datagrams that the agent has."""
+    welcomed: bool
+    """True if a master has spoken on this link.  Then only that master can continue it."""
+
+    def encode(self) -> bytes:
+        """Return the datagram."""
+        return _encode(_HELLO, self)
+
+
+class MasterWelcome(NamedTuple):
+    """Greeting of a master that takes a new link, or continues a known one."""
+
+    identity: Identity
+    arrived: int
+    """Number of the agent's datagrams that the master has."""
+    heartbeat: float
+    """Limits of silence on the link: the fields of a ``Keepalive``, in seconds."""
+    suspect_after: float
+    lost_after: float
+    lost_grace: float | None = None
+    """Seconds for which the agent waits for another master if this one is lost.  None: it uses its
+    own setting, or waits for none."""
+    epoch: int = 0
+    """Number of this master among those that follow one another in a pool."""
+
+    def encode(self) -> bytes:
+        """Return the datagram."""
+        return _encode(_WELCOME, self)
+
+
+class MasterRefusal(NamedTuple):
+    """Greeting of a master that refuses the agent."""
+
+    identity: Identity
+    reason: str
+
+    def encode(self) -> bytes:
+        """Return the datagram."""
+        return _encode(_REFUSAL, self)
+
+
+_UNREADABLE = (
+    ValueError,
+    KeyError,
+    TypeError,
+    AttributeError,
+    OverflowError,  # an infinite number
+    RecursionError,  # brackets without end
+)
+
+Greeting: TypeAlias = AgentHello | MasterWelcome | MasterRefusal
+
+
+def decode_greeting(datagram: bytes) -> Greeting:
+    """Read a greeting; ProtocolError if it is none."""
+    reader = _READERS.get(datagram[0]) if datagram else None
+    if reader is None:
+        raise ProtocolError(f"its first {len(datagram)} bytes are no greeting")
+    try:
+        fields = json.loads(datagram[1:])
+        return reader(_identity(fields["identity"]), fields)
+    except _UNREADABLE as error:
+        # Whatever JSON holds instead of what belongs there.
+        raise ProtocolError(
+            f"its greeting is malformed ({type(error).__name__}: {error})"
+        ) from None
+
+
+def version_mismatch(ours: Identity, theirs: Identity) -> VersionMismatch | None:
+    """Why these two cannot work together: pickles and messages cross, so both must be equal."""
+    if ours.protocol != theirs.protocol:
+        return VersionMismatch(
+            "Fiber protocol",
+            ours=f"{ours.protocol} (fiberpool {ours.fiber})",
+            theirs=f"{theirs.protocol} (fiberpool {theirs.fiber})",
+            peer=theirs.name,
+        )
+    if _minor(ours.python) != _minor(theirs.python):
+        return VersionMismatch("Python", ours=ours.python, theirs=theirs.python, peer=theirs.name)
+    return None
+
+
+def _minor(version: str) -> list[str]:
+    return version.split(".")[:2]
+
+
+def _fiber_version() -> str:
+    try:
+        return metadata.version("fiberpool")
+    except metadata.PackageNotFoundError:
+        # Run from a source tree that was never installed.
+        return "unknown"
+
+
+def _encode(kind: int, greeting: Greeting) -> bytes:
+    fields = {**greeting._asdict(), "identity": dataclasses.asdict(greeting.identity)}
+    return bytes([kind]) + json.dumps(fields).encode()
+
+
+def _identity(fields: Mapping[str, Any]) -> Identity:
+    facts = {str(key): str(value) for key, value in fields["facts"].items()}
+    return Identity(
+        _name(fields["name"]),
+        int(fields["protocol"]),
+        str(fields["python"]),
+        str(fields["fiber"]),
+        facts,
+        _name(fields.get("uid", "")),
+    )
+
+
+def _name(value: object) -> str:
+    """Return a name or uid; ValueError if it is too long or cannot be encoded."""
+    name = str(value)
+    if len(name) > _LONGEST_NAME:
+        raise ValueError(f"a name of {len(name)} characters")
+    name.encode()
+    return name
+
+
+def _read_hello(identity: Identity, fields: Mapping[str, Any]) -> AgentHello:
+    if identity.protocol != PROTOCOL:  # another version may put other things here
+        return AgentHello(identity, "", 0, False)
+    return AgentHello(
+        identity, str(fields["link"]), int(fields["arrived"]), bool(fields["welcomed"])
+    )
+
+
+def _read_welcome(identity: Identity, fields: Mapping[str, Any]) -> MasterWelcome:
+    grace = fields.get("lost_grace")
+    return MasterWelcome(
+        identity,
+        int(fields["arrived"]),
+        heartbeat=float(fields["heartbeat"]),
+        suspect_after=float(fields["suspect_after"]),
+        lost_after=float(fields["lost_after"]),
+        lost_grace=None if grace is None else float(grace),
+        epoch=int(fields.get("epoch", 0)),
+    )
+
+
+def _read_refusal(identity: Identity, fields: Mapping[str, Any]) -> MasterRefusal:
+    return MasterRefusal(identity, str(fields["reason"]))
+
+
+_READERS: dict[int, Callable[[Identity, Mapping[str, Any]], Greeting]] = {
+    _HELLO: _read_hello,
+    _WELCOME: _read_welcome,
+    _REFUSAL: _read_refusal,
+}
+
+
+def parse_address(address: str) -> tuple[str, int]:
+    """Return host and port; ConfigError if there are none.  ``[::1]:80`` is an address too."""
+    host, _, port = address.rpartition(":")
+    if not host or not port.isdecimal() or int(port) > 65535:
+        raise ConfigError(f"{address!r} is no address: it must be host:port, as in 10.0.0.7:8642")
+    return host.strip("[]"), int(port)
+
+
+def parse_addresses(addresses: str) -> list[tuple[str, int]]:
+    """Parse addresses with commas between them, all of one master."""
+    return [parse_address(address) for address in addresses.split(",")]
+
+
+def join_address(host: str, port: int | str) -> str:
+    """Return ``host:port``, an IPv6 address in brackets; ``port`` may be a range."""
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
+SECRET_SIZE = 32
+
+
+class Secrets(NamedTuple):
+    """Secrets from which one side derives the keys of a connection."""
+
+    outgoing: bytes
+    incoming: bytes
+
+    def __repr__(self) -> str:
+        return "Secrets(...)"
+
+
+def derive(agent: bytes, master: bytes, *, for_master: bool) -> Secrets:
+    """Derive the secrets of a connection from the random bytes of both sides (HKDF, RFC 5869)."""
+    both = hmac.digest(b"fiber link", agent + master, "sha256")
+    up, down = expand(both, b"agent to master"), expand(both, b"master to agent")
+    return Secrets(down, up) if for_master else Secrets(up, down)
+
+
+def expand(secret: bytes, label: bytes) -> bytes:
+    """Derive one more secret (the second step of HKDF)."""
+    return hmac.digest(secret, b"fiber " + label + b"\x01", "sha256")
+
 
 _T = TypeVar("_T")
 Steps: TypeAlias = Generator[int, None, _T]
