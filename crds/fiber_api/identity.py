@@ -1,6 +1,6 @@
-"""The key of a pool, and the key of each agent that comes from it.  Standard library only.
+"""Key of a pool, and the key of each agent that is derived from it. Standard library only.
 
-An agent proves by its own key that it is the pod of that name and uid.  The pool's key gives the
+An agent proves by its own key that it is the pod of that name and uid. The pool's key gives the
 keys of all its agents, so only the operator, the master and a pod's first init container see it.
 """
 

@@ -1,7 +1,7 @@
-"""What the models of the resource have in common: how they read, and rules beyond types.
+"""Common base of the models of the resource: how they read, and rules beyond types.
 
-Reading is strict about types, as the API server is: ``"3"`` is no integer.  It is tolerant of
-fields that it does not know, which a newer release may have written, and takes null for absent.
+Reading is strict about types, as the API server is: ``"3"`` is no integer. It accepts unknown
+fields, which a newer release may have written, and takes null for absent.
 """
 
 from __future__ import annotations
@@ -28,26 +28,27 @@ from pydantic_core import CoreSchema, ErrorDetails, InitErrorDetails, PydanticCu
 from fiber_api.times import EARLIEST, LATEST, format_time, parse_time
 
 PRESERVE = "x-kubernetes-preserve-unknown-fields"
-"""In a schema: fields that it does not name are kept, as they came."""
+"""Mark of a schema that keeps unknown fields as they came."""
 
 LIST_AS_MAP = {"x-kubernetes-list-type": "map"}
-"""In a schema: items are told apart by keys, not by their places."""
+"""Mark of a schema whose list items are told apart by keys, not by their places."""
 
 
 @dataclass(frozen=True)
 class Rule:
-    """One thing that must hold between fields: for the API server in CEL, and here in Python."""
+    """Rule that must hold between fields: for the API server in CEL, and here in Python."""
 
     field: str
-    """The path from this model to the field that is to blame."""
+    """Path from this model to the field that is to blame."""
     cel: str
     message: str
-    """The rule, and what to do.  ``kubectl`` shows it after the field's path."""
+    """Rule, and what to do. ``kubectl`` shows it after the field's path."""
     holds: Callable[[Any], bool] | None
-    """None for a rule about a change, which needs the old object: the API server's alone."""
+    """Check in Python; None for a rule about a change, which needs the old object and so the API
+    server."""
 
     def document(self) -> dict[str, str]:
-        """An item of ``x-kubernetes-validations``."""
+        """Return an item of ``x-kubernetes-validations``."""
         if self.field.startswith("metadata."):
             # Metadata is no part of the schema, and a path cannot lead there.
             return {"rule": self.cel, "message": f"{self.field} {self.message}"}
@@ -55,7 +56,7 @@ class Rule:
 
 
 class Model(BaseModel):
-    """A part of the resource.  Immutable; fields have the API's names in JSON."""
+    """Part of the resource. Immutable; fields have the API's names in JSON."""
 
     model_config = ConfigDict(
         alias_generator=to_camel,
@@ -68,7 +69,7 @@ class Model(BaseModel):
 
     RULES: ClassVar[tuple[Rule, ...]] = ()
     OPAQUE: ClassVar = False
-    """Whether the API server keeps what it does not know here, instead of dropping it."""
+    """True if the API server keeps unknown fields here, instead of dropping them."""
 
     @classmethod
     def __get_pydantic_json_schema__(
@@ -122,7 +123,7 @@ Time = Annotated[
     PlainSerializer(format_time, return_type=str),
     WithJsonSchema({"type": "string", "format": "date-time"}),
 ]
-"""Unix seconds that the API writes as RFC 3339: whole ones, so that what is read is what was
+"""Unix seconds that the API writes as RFC 3339. They are whole, so that reading returns what was
 written."""
 
 
@@ -135,7 +136,7 @@ _WORDS = {
 
 
 def describe(error: ValidationError, inside: tuple[str, ...] = ()) -> tuple[str, ...]:
-    """What is wrong, a line each, every one beginning with the field: ``spec.master.port …``."""
+    """Return the errors, a line each, which begins with the field: ``spec.master.port …``."""
     return tuple(
         _sentence(_path(inside + detail["loc"]), detail)
         for detail in error.errors(include_url=False, include_context=False)
@@ -165,7 +166,8 @@ def _short(value: object) -> str:
 
 
 def flat_schema(model: type[Model]) -> dict[str, Any]:
-    """The JSON schema of ``model`` with every definition in its place instead of referred to."""
+    """Return the JSON schema of ``model`` with every definition in its place instead of referred
+    to."""
     schema = model.model_json_schema()
     definitions = schema.pop("$defs", {})
 
@@ -176,7 +178,7 @@ def flat_schema(model: type[Model]) -> dict[str, Any]:
             return value
         reference = value.get("$ref", "").removeprefix("#/$defs/")
         rest = {key: flat(item) for key, item in value.items() if key != "$ref"}
-        # What the field says of itself goes before what its type says.
+        # The field's own description goes before that of its type.
         return {**flat(definitions[reference]), **rest} if reference else rest
 
     result: dict[str, Any] = flat(schema)

@@ -1,7 +1,7 @@
-"""Every name that the SDK and the operator must agree on.  Standard library only.
+"""Names that the SDK and the operator must agree on. Standard library only.
 
 A name that appears in a cluster is part of the contract: objects made by an older release carry it.
-Add to this module freely; change nothing in it without a new API version.
+Add to this module freely; change no name without a new API version.
 """
 
 from __future__ import annotations
@@ -23,130 +23,134 @@ SHORT_NAMES: Final = ("fp", "fpool")
 CATEGORIES: Final = ("all", "fiber")
 CRD_NAME: Final = f"{PLURAL}.{GROUP}"
 
-# -- Who writes: field managers of server-side apply, and the value of LABEL_MANAGED_BY
+# -- Writers: field managers of server-side apply, and the value of LABEL_MANAGED_BY
 
 SDK_MANAGER: Final = "fiber-sdk"
-"""Owns ``spec.replicas``, ``spec.scaleDown.release`` and ``spec.master``."""
+"""Owner of ``spec.replicas``, ``spec.scaleDown.release`` and ``spec.master``."""
 OPERATOR_MANAGER: Final = "fiber-operator"
-"""Owns the status, the pods, the Service, its EndpointSlice and the Secret, unless
-``spec.credentialsSecretName`` names one; never the spec."""
+"""Owner of the status, the pods, the Service, its EndpointSlice and the Secret, unless
+``spec.credentialsSecretName`` names one; never of the spec."""
 
 # -- Labels and annotations
 
 LABEL_POOL: Final = f"{GROUP}/pool"
 LABEL_POOL_UID: Final = f"{GROUP}/pool-uid"
-"""Tells a pool from an earlier one of the same name: pods are selected by it."""
+"""Uid of the pool, which tells it from an earlier one of the same name: pods are selected by it."""
 LABEL_TEMPLATE_HASH: Final = f"{GROUP}/template-hash"
-"""The hash of the user's template alone, so that a new operator restarts nothing."""
+"""Hash of the user's template alone, so that a new operator restarts no worker."""
 LABEL_EPOCH: Final = f"{GROUP}/epoch"
-"""The master's epoch when the pod was made."""
+"""Epoch of the master when the pod was made."""
 LABEL_MANAGED_BY: Final = "app.kubernetes.io/managed-by"
 LABEL_SERVICE_NAME: Final = "kubernetes.io/service-name"
-"""Kubernetes': ties an EndpointSlice to its Service."""
+"""Kubernetes' label that ties an EndpointSlice to its Service."""
 LABEL_SLICE_MANAGED_BY: Final = "endpointslice.kubernetes.io/managed-by"
-"""Kubernetes': who writes an EndpointSlice."""
+"""Kubernetes' label for the writer of an EndpointSlice."""
 ANNOTATION_DELETION_COST: Final = "controller.kubernetes.io/pod-deletion-cost"
-"""Kubernetes': of two pods alike, policy Any deletes the one with the lower cost first."""
+"""Kubernetes' annotation: of two equal pods, policy Any deletes the one with the lower cost
+first."""
 ANNOTATIONS_KEEP_NODE: Final = {
     "cluster-autoscaler.kubernetes.io/safe-to-evict": "false",
     "karpenter.sh/do-not-disrupt": "true",
 }
-"""What keeps the cluster autoscaler and Karpenter from emptying a node under workers at work."""
+"""Annotations that keep the cluster autoscaler and Karpenter from emptying a node with working
+workers."""
 ANNOTATION_CONNECTED: Final = f"{GROUP}/connected-agents"
-"""Of a master's Lease: how many agents were linked to it when it was renewed."""
+"""Annotation of a master's Lease: number of agents that were linked to it at the renewal."""
 
 # -- The sign that an operator serves a namespace
 
 SERVING_LEASE: Final = f"operator.{GROUP}"
-"""The Lease that each operator renews where it serves.  Several operators may write it: a fresh one
-says that an operator lives.  ``operator_lease_name`` never gives this name."""
+"""Lease that each operator renews in the namespaces that it serves. Several operators may write it:
+a fresh one says that an operator lives. ``operator_lease_name`` never gives this name."""
 SERVING_NAMESPACE: Final = "kube-public"
-"""Where that Lease is if the operator serves all namespaces; else in each that it serves.  Every
-cluster has this namespace."""
+"""Namespace of that Lease if the operator serves all namespaces; else it is in each served one.
+Every cluster has this namespace."""
 SERVING_SECONDS: Final = 300
-"""How long the Lease is fresh: longer than a restart or an upgrade of the operator takes."""
+"""Seconds for which the Lease is fresh: longer than a restart or an upgrade of the operator
+takes."""
 
 # -- The worker container
 
 WORKER_CONTAINER: Final = "worker"
-"""What ``spec.workerContainer`` is when left out."""
+"""Default of ``spec.workerContainer``."""
 
 ENV_NAME: Final = "FIBER_AGENT_NAME"
-"""The pod's name: what the master calls the agent, and releases it by.  Always the operator's,
-whatever the template says."""
+"""Pod's name: the master calls the agent by it, and releases it by it. Always the operator's value,
+even if the template sets another."""
 ENV_UID: Final = "FIBER_AGENT_UID"
-"""The pod's uid, which no other pod of that name has."""
+"""Pod's uid, which no other pod of that name has."""
 ENV_TEMPLATE_HASH: Final = "FIBER_AGENT_TEMPLATE_HASH"
-"""The pod's LABEL_TEMPLATE_HASH: by it the master tells which agents are outdated."""
+"""Pod's LABEL_TEMPLATE_HASH, by which the master finds outdated agents."""
 ENV_ADDRESS: Final = "FIBER_AGENT_ADDRESS"
-"""``host:port`` of the pool's Service."""
+"""Address of the pool's Service, ``host:port``."""
 ENV_CREDENTIALS: Final = "FIBER_AGENT_CREDENTIALS"
-"""The file with the agent's credentials.  The agent removes it before it starts a child."""
+"""File with the agent's credentials. The agent removes it before it starts a child."""
 ENV_KEY: Final = "FIBER_AGENT_KEY"
-"""The folder with the pool's key: set in the init container alone, which writes ENV_CREDENTIALS."""
+"""Folder with the pool's key. Only the init container has it, which writes ENV_CREDENTIALS."""
 ENV_POOL: Final = "FIBER_AGENT_POOL"
 ENV_NAMESPACE: Final = "FIBER_AGENT_NAMESPACE"
 ENV_PROCESSES: Final = "FIBER_AGENT_PROCESSES"
-"""How many children the agent runs: ``spec.processesPerPod``."""
+"""Number of children that the agent runs: ``spec.processesPerPod``."""
 ENV_LOST_GRACE: Final = "FIBER_AGENT_LOST_GRACE"
 """Seconds that an agent outlives its master: ``spec.master.lostGraceSeconds``."""
 ENV_TERMINATION_GRACE: Final = "FIBER_AGENT_TERMINATION_GRACE"
 """Seconds that a pod has after SIGTERM: the template's ``terminationGracePeriodSeconds``."""
 ENV_LINKED: Final = "FIBER_AGENT_LINKED"
-"""The file that the agent makes once a master has answered it; the startup probe waits for it."""
+"""File that the agent makes once a master has answered it; the startup probe waits for it."""
 
 IDENTITY_CONTAINER: Final = "fiber-identity"
-"""The first init container: derives the agent's key from the pool's."""
+"""First init container, which derives the agent's key from the pool's."""
 KEY_VOLUME: Final = "fiber-key"
 KEY_DIRECTORY: Final = "/etc/fiber/key"
-"""The pool's Secret, which no other container mounts."""
+"""Volume with the pool's Secret, which no other container mounts."""
 CREDENTIALS_VOLUME: Final = "fiber-credentials"
 CREDENTIALS_DIRECTORY: Final = "/etc/fiber/credentials"
 CREDENTIALS_FILE: Final = "agent.json"
 PROBE_PROGRAM: Final = "python"
-"""Beside the credentials: the interpreter that runs the startup probe.  The init container links it
-to its own, since nobody else knows where an image has one."""
+"""Interpreter that runs the startup probe, beside the credentials. The init container links it to
+its own, because only the image knows its path."""
 LINKED_FILE: Final = "linked"
 
 # -- The way to the master
 
 MASTER_PORT: Final = 7070
-"""The port of the Service; the master itself listens where ``spec.master.port`` says."""
+"""Port of the Service; the master itself listens at ``spec.master.port``."""
 MASTER_PORT_NAME: Final = "fiber"
 ENDPOINT_SCHEME: Final = "tls+tcp"
 
 # -- The Secret: its keys
 
 KEY_POOL: Final = "key"
-"""256 random bits in hexadecimal digits, from which the key of each agent is derived."""
+"""Entry with 256 random bits in hexadecimal digits, from which each agent's key is derived."""
 KEY_MASTER: Final = "master"
-"""The SHA-256 of the certificate of the only master that the pool ever has; absent where one master
-may follow another."""
+"""Entry with the SHA-256 of the certificate of the only master that the pool ever has; absent if
+one master may follow another."""
 
 # -- Limits
 
 MAX_POOL_NAME: Final = 50
-"""Leaves room for what is appended to it: pod and Service names end at 63 characters."""
+"""Longest name of a pool, with room for suffixes: pod and Service names end at 63 characters."""
 MAX_RELEASE: Final = 500
 """Pods that one ``spec.scaleDown.release`` may name."""
 MAX_PROBLEMS: Final = 10
 """Problems that a status shows."""
 POD_SUFFIX_LENGTH: Final = 10
-"""Hexadecimal digits that end a pod's name; forty bits, drawn at random and never used again."""
+"""Hexadecimal digits that end a pod's name; forty random bits, never used again."""
 
 POOL_NAME_PATTERN: Final = "[a-z]([-a-z0-9]*[a-z0-9])?"
-"""A Service is called after the pool: its name must be a DNS label that begins with a letter."""
+"""Pattern of a pool's name. Its Service has the same name, which must be a DNS label that begins
+with a letter."""
 
 _POOL_NAME = re.compile(POOL_NAME_PATTERN)
 _POD_SUFFIX = re.compile(f"[0-9a-f]{{{POD_SUFFIX_LENGTH}}}")
 
 
 class InvalidName(ValueError):
-    """A name that Kubernetes would refuse; the message says which, why, and what to use."""
+    """Name that Kubernetes would refuse; the message says which, why, and what to use."""
 
 
 def check_pool_name(pool: str) -> str:
-    """``pool`` itself, if a FiberPool may have that name; else ``InvalidName``."""
+    """Return ``pool`` itself, if a FiberPool may have that name; else raise ``InvalidName``."""
     if len(pool) > MAX_POOL_NAME:
         raise InvalidName(
             f"the pool name {pool!r} has {len(pool)} characters, more than {MAX_POOL_NAME}: the "
@@ -161,103 +165,105 @@ def check_pool_name(pool: str) -> str:
 
 
 def pod_name(pool: str, suffix: str) -> str:
-    """The name of one pod: at most 61 characters.  The caller draws the suffix."""
+    """Return the name of one pod: at most 61 characters. The caller draws the suffix."""
     if not _POD_SUFFIX.fullmatch(suffix):
         raise InvalidName(f"{suffix!r} is not {POD_SUFFIX_LENGTH} hexadecimal digits")
     return f"{pool}-{suffix}"
 
 
 def service_name(pool: str) -> str:
-    """The Service that agents dial: at most 56 characters."""
+    """Return the name of the Service that agents dial: at most 56 characters."""
     return f"{pool}-fiber"
 
 
 def endpoint_slice_name(pool: str) -> str:
-    """The Service's one EndpointSlice."""
+    """Return the name of the Service's one EndpointSlice."""
     return service_name(pool)
 
 
 def budget_name(pool: str) -> str:
-    """The PodDisruptionBudget of the pool's workers."""
+    """Return the name of the PodDisruptionBudget of the pool's workers."""
     return service_name(pool)
 
 
 def secret_name(pool: str) -> str:
-    """The Secret with the pool's key: at most 60 characters."""
+    """Return the name of the Secret with the pool's key: at most 60 characters."""
     return f"{pool}-fiber-key"
 
 
 def master_lease_name(pool: str) -> str:
-    """The Lease that the SDK makes and names in ``spec.master.leaseName``.
+    """Return the name of the Lease that the SDK makes and names in ``spec.master.leaseName``.
 
-    Its labels are LABEL_POOL and LABEL_POOL_UID, by which the operator hears of its renewals.
+    Its labels are LABEL_POOL and LABEL_POOL_UID, by which the operator's watch finds it.
     """
     return f"fiber-{pool}"
 
 
 def operator_lease_name(release: str) -> str:
-    """The Lease by which one process of a release acts: with dots, which no master's Lease has."""
+    """Return the name of the Lease by which one process of a release acts: with dots, unlike
+    masters'."""
     return f"{release}.operator.{GROUP}"
 
 
 def address_of(host: str, port: int | str) -> str:
-    """``host:port``, an IPv6 address in brackets; ``port`` may be a range."""
+    """Return ``host:port``, an IPv6 address in brackets; ``port`` may be a range."""
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
 def endpoint_of(address: str) -> str:
-    """``host:port`` as ``status.endpoint`` shows it."""
+    """Return ``host:port`` as ``status.endpoint`` shows it."""
     return f"{ENDPOINT_SCHEME}://{address}"
 
 
-# -- What a status says
+# -- Words of a status
 
 
 class ConditionType(StrEnum):
-    """The types of ``status.conditions``."""
+    """Types of ``status.conditions``."""
 
     ACCEPTED = "Accepted"
-    """The operator understands the spec and the API server accepts its pods."""
+    """Condition: the operator understands the spec and the API server accepts its pods."""
     READY = "Ready"
-    """As many workers as wanted are ready."""
+    """Condition: as many workers as wanted are ready."""
     PROGRESSING = "Progressing"
-    """Something is under way: pods are created, waited for, replaced or deleted."""
+    """Condition: pods are being created, waited for, replaced or deleted."""
     DEGRADED = "Degraded"
-    """Workers fail or cannot be had; the reason is the worst problem's."""
+    """Condition: workers fail or cannot be had; the reason is the worst problem's."""
     MASTER_ALIVE = "MasterAlive"
-    """Unknown while there is no master, or no Lease to tell by."""
+    """Condition: the master lives. Unknown without a master, or without a Lease."""
     SCALING_LIMITED = "ScalingLimited"
-    """``replicas`` asks for more than ``maxReplicas``, or for some and fewer than
+    """Condition: ``replicas`` asks for more than ``maxReplicas``, or for some and fewer than
     ``minReplicas``."""
     SUSPENDED = "Suspended"
-    """``spec.suspend`` holds the pool at no pods."""
+    """Condition: ``spec.suspend`` holds the pool at no pods."""
 
 
 class Phase(StrEnum):
-    """``status.phase``: the conditions in one word, for people.  Programs read the conditions."""
+    """Values of ``status.phase``: the conditions in one word, for people. Programs read the
+    conditions."""
 
     PENDING = "Pending"
-    """It has no workers, and the API server has not said yet whether it takes any."""
+    """Phase without workers, until the API server has said whether it accepts any."""
     SCALING = "Scaling"
-    """Workers are on their way, or are leaving."""
+    """Phase in which workers are on their way, or are leaving."""
     READY = "Ready"
-    """What is wanted is there, even if that is nothing."""
+    """Phase in which as many workers as wanted are ready, even if that is none."""
     DEGRADED = "Degraded"
-    """Something is wrong that may still pass; problems say what."""
+    """Phase with a problem that may still pass."""
     FAILED = "Failed"
-    """Nothing more is created until the spec changes; problems say why."""
+    """Phase in which no pod is created until the spec changes; problems say why."""
     SUSPENDED = "Suspended"
     TERMINATING = "Terminating"
-    """The pool is being deleted."""
+    """Phase in which the pool is being deleted."""
 
 
 class Reason(StrEnum):
-    """Why: reasons of problems, conditions and events.  The SDK raises those of problems.
+    """Reasons of problems, conditions and events. The SDK raises those of problems.
 
-    Where Kubernetes has a word for it, this is Kubernetes' word.
+    Where Kubernetes has a word for a reason, it is used here.
     """
 
-    # Problems: the spec, or what the API server makes of it.
+    # Problems: the spec, or the API server's judgement of it.
     INVALID_SPEC = "InvalidSpec"
     """The operator cannot read the spec."""
     INVALID_TEMPLATE = "InvalidTemplate"
@@ -269,7 +275,7 @@ class Reason(StrEnum):
     FORBIDDEN = "Forbidden"
     """An admission policy, or a right that the operator lacks (403 for any other cause)."""
     NAME_TAKEN = "NameTaken"
-    """An object that is not the pool's has a name that the pool needs."""
+    """An object of another owner has a name that the pool needs."""
     INVALID_CREDENTIALS = "InvalidCredentials"
     """The pool's Secret is damaged or about to expire."""
     ADDRESS_CHANGED = "AddressChanged"
@@ -277,7 +283,7 @@ class Reason(StrEnum):
     CREDENTIALS_CHANGED = "CredentialsChanged"
     """The Secret was made anew, and workers hold keys of the old one."""
     INVALID_RELEASE = "InvalidRelease"
-    """``scaleDown.release`` names what is not a pod of this pool."""
+    """``scaleDown.release`` names an object that is no pod of this pool."""
 
     # Problems: pods that do not start.
     INVALID_IMAGE_NAME = "InvalidImageName"
@@ -288,41 +294,41 @@ class Reason(StrEnum):
     RUN_CONTAINER_ERROR = "RunContainerError"
     UNSCHEDULABLE = "Unschedulable"
     STARTUP_TIMEOUT = "StartupTimeout"
-    """Not ready for ``failurePolicy.startupTimeoutSeconds``."""
+    """The worker was not ready for ``failurePolicy.startupTimeoutSeconds``."""
 
     # Problems: pods that end.
     CONTAINER_FAILED = "ContainerFailed"
     """The worker exited with a code other than 0."""
     OOM_KILLED = "OOMKilled"
     COMPLETED = "Completed"
-    """The worker exited with code 0 though nobody released it."""
+    """The worker exited with code 0 and was not released."""
     DISRUPTED = "Disrupted"
-    """Evicted, preempted, deleted by someone, or its node is gone: replaced and not counted."""
+    """Evicted, preempted, deleted, or its node is gone: replaced, and not counted as a failure."""
     NOT_READY = "NotReady"
-    """A pod that was ready is not any more."""
+    """A pod that was ready is no longer ready."""
     BACKOFF_LIMIT_EXCEEDED = "BackoffLimitExceeded"
-    """``failurePolicy.backoffLimit`` failures in a row: nothing more is created."""
+    """More than ``failurePolicy.backoffLimit`` failures in a row: no pod is created."""
 
     # Problems: the master and the API server.
     MASTER_LOST = "MasterLost"
     """The master's Lease has expired."""
     LEASE_NOT_FOUND = "LeaseNotFound"
-    """There is no Lease of the name in ``spec.master.leaseName`` yet, or not any more."""
+    """The Lease that ``spec.master.leaseName`` names does not exist yet, or was deleted."""
     API_UNAVAILABLE = "ApiUnavailable"
     """A call of the operator fails: an admission webhook is down, the API server is busy."""
 
-    # Conditions: what is neither good nor bad news.
+    # Conditions without a problem.
     AS_EXPECTED = "AsExpected"
     NOT_JUDGED = "NotJudged"
-    """The API server has not said yet whether it takes pods of the template."""
+    """The API server has not said yet whether it accepts pods of the template."""
     CREATING = "Creating"
     STARTING = "Starting"
     BACKING_OFF = "BackingOff"
     DRAINING = "Draining"
-    """More workers are ready than wanted, and only the master may say which are idle."""
+    """More workers are ready than wanted, and only the master knows which are idle."""
     DELETING = "Deleting"
     UPDATING = "Updating"
-    """Pods of an older template are there."""
+    """Some pods have an older template."""
     SCALED_TO_ZERO = "ScaledToZero"
     SUSPENDED = "Suspended"
     NOT_SUSPENDED = "NotSuspended"

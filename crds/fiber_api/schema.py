@@ -1,13 +1,11 @@
-"""The CustomResourceDefinition, generated from the models.
-
-::
+"""CustomResourceDefinition, generated from the models.
 
     python -m fiber_api.schema            writes crds/fiberpools.yaml and the chart's template of it
     python -m fiber_api.schema --check    compares, and fails where they differ
 
-A schema in Kubernetes is structural: no references, no alternatives, nothing that is only in one of
-several places.  What pydantic emits is translated.  The rules need Kubernetes 1.31, which can tell
-an IP address from a host name.
+A schema in Kubernetes is structural: it has no references and no alternatives, and each part stands
+in one place. This module translates pydantic's schema. The rules need Kubernetes 1.31, which can
+tell an IP address from a host name.
 """
 
 from __future__ import annotations
@@ -24,7 +22,7 @@ from fiber_api.model import flat_schema
 from fiber_api.v1alpha1 import FiberPool
 
 MAX_SIZE = 30_000
-"""Bytes.  What clients apply is copied into an annotation, which has little room."""
+"""Largest size in bytes. Clients copy what they apply into an annotation, which has little room."""
 
 _HEADER = "# Generated from crds/fiber_api by `make crds`; edit the models, not this file.\n"
 
@@ -40,11 +38,11 @@ _COLUMNS = (
 )
 
 _WIDE_COLUMNS = (("Message", "string", ".status.problems[0].message", "The worst problem"),)
-"""Shown by ``kubectl get -o wide`` alone."""
+"""Priority of a column that only ``kubectl get -o wide`` shows."""
 
 
 def definition() -> dict[str, Any]:
-    """The CustomResourceDefinition as a document."""
+    """Return the CustomResourceDefinition as a document."""
     return {
         "apiVersion": "apiextensions.k8s.io/v1",
         "kind": "CustomResourceDefinition",
@@ -89,21 +87,21 @@ def _column(name: str, kind: str, path: str, description: str) -> dict[str, Any]
 
 
 def schema() -> dict[str, Any]:
-    """The structural schema of a FiberPool."""
+    """Return the structural schema of a FiberPool."""
     document = _structural(flat_schema(FiberPool))
     properties = document["properties"]
     properties["apiVersion"] = {"type": "string", "description": f"{names.API_VERSION}."}
     properties["kind"] = {"type": "string", "description": f"{names.KIND}."}
     # The API server has its own schema of metadata and allows none here.
     properties["metadata"] = {"type": "object"}
-    # Only the operator writes a status; what it did not write, nobody shall read.
+    # Only the operator writes a status. Defaults would show values that it did not write.
     properties["status"] = _without_defaults(properties["status"])
     document["required"] = ["spec"]
     return document
 
 
 def _structural(source: dict[str, Any]) -> dict[str, Any]:
-    """``source`` in the API server's dialect of JSON schema."""
+    """Return ``source`` in the API server's dialect of JSON schema."""
     result = _without_null(source)
     result.pop("title", None)
     if "description" in result:
@@ -150,19 +148,19 @@ def _translate_default(result: dict[str, Any]) -> None:
     if result["default"] is None or result["default"] == []:
         del result["default"]
     elif isinstance(result["default"], dict):
-        # Each field of it has its own default; together they are what the models say.
+        # Each field of it has its own default; together they are the models' defaults.
         result["default"] = {}
 
 
 def manifest() -> str:
-    """What ``kubectl apply -f`` takes."""
+    """Return the text for ``kubectl apply -f``."""
     return _HEADER + _yaml(definition())
 
 
 def chart_template() -> str:
-    """The same for Helm, which never upgrades what is in a chart's ``crds`` folder.
+    """Return the template for Helm, which never upgrades the files in a chart's ``crds`` folder.
 
-    Helm leaves it, and with it all pools, when the release is uninstalled.
+    Helm leaves the resource type, and with it all pools, when the release is uninstalled.
     """
     document = definition()
     body = _yaml({"spec": document["spec"]})
@@ -192,11 +190,11 @@ _FILES = {
     "crds/fiberpools.yaml": manifest,
     "charts/fiber-operator/templates/crd.yaml": chart_template,
 }
-"""By path from the root of the repository."""
+"""Generated files, by path from the root of the repository."""
 
 
 def _stale(root: Path) -> list[str]:
-    """The generated files that are absent or differ from what they should be."""
+    """Return the generated files that are absent or out of date."""
     return [
         name
         for name, text in _FILES.items()
@@ -205,7 +203,7 @@ def _stale(root: Path) -> list[str]:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Write or compare the generated files; the exit status."""
+    """Write or compare the generated files; return the exit status."""
     parser = argparse.ArgumentParser(prog="python -m fiber_api.schema", description=__doc__)
     parser.add_argument("--check", action="store_true", help="write nothing; fail if stale")
     options = parser.parse_args(argv)

@@ -1,4 +1,4 @@
-"""``status``: what the operator says of a pool, and what it remembers of it."""
+"""Status of a pool: the operator's report on it, and its memory of it."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ class Failures(Model):
 
     consecutive: Count = 0
     """Waves in a row since half of the workers wanted were last ready for a minute. With more than
-    failurePolicy.backoffLimit nothing more is created."""
+    failurePolicy.backoffLimit no pod is created."""
     waves: Count = 0
     """Waves in a row since a new worker was last ready for a minute. Each doubles the time until
-    those that failed are replaced."""
+    failed workers are replaced."""
     waiting: Count = 0
     """Workers that are not replaced before nextCreateTime."""
     total: Count = 0
@@ -35,62 +35,64 @@ class Failures(Model):
     last_exit_code: ExitCode | None = None
     """Exit code of the worker that failed last."""
     last_reason: str | None = None
-    """Why it failed."""
+    """Reason of that failure."""
     next_create_time: Time | None = None
-    """Workers that failed are not replaced before this time."""
+    """Time before which failed workers are not replaced."""
     counted: Annotated[
         tuple[str, ...],
         Field(strict=False, json_schema_extra={"x-kubernetes-list-type": "atomic"}),
     ] = ()
     """Pods that are in these sums and still exist."""
     spec_hash: str | None = None
-    """Hash of the part of the spec that these waves are of; when it changes they are forgotten."""
+    """Hash of the part of the spec that these waves belong to; when it changes they are
+    forgotten."""
 
 
 class Problem(Model):
-    """Something that keeps workers from running."""
+    """Problem that keeps workers from running."""
 
     reason: str
-    """One word for programs, such as ImagePullError or Unschedulable."""
+    """Word for programs, such as ImagePullError or Unschedulable."""
     severity: Literal["Error", "Warning"] = "Error"
-    """A Warning may pass by itself; an Error is raised in the program that waits."""
+    """Warning or Error. A Warning may pass by itself; an Error is raised in the program that
+    waits."""
     terminal: bool = False
-    """Whether waiting cannot help: something must be changed first."""
+    """True if waiting cannot help: the pool or the cluster must be changed first."""
     count: Count = 1
     """Pods that have this problem, or attempts that failed with it."""
     since: Time | None = None
-    """Since when it is there."""
+    """Time since which the problem exists."""
     pod: str | None = None
-    """One pod that has it, to look at."""
+    """Example pod that has the problem."""
     message: str = ""
-    """What happened, why, and what to do."""
+    """Sentences: what happened, why, and what to do."""
 
 
 class Condition(Model):
-    """One condition, as in every Kubernetes resource."""
+    """Condition, as in every Kubernetes resource."""
 
     type: str
-    """Which condition."""
+    """Type of the condition."""
     status: Literal["True", "False", "Unknown"]
     """True, False or Unknown."""
     reason: str = ""
-    """Why, in one word for programs."""
+    """Reason, in one word for programs."""
     message: str = ""
-    """Why, for people."""
+    """Reason, in words for people."""
     last_transition_time: Time | None = None
-    """When the status of the condition changed last."""
+    """Time at which the status of the condition changed last."""
     observed_generation: int | None = None
-    """The generation of the resource that this was found of."""
+    """Generation of the resource that the condition describes."""
 
 
 class FiberPoolStatus(Model):
-    """What is there. Written by the operator."""
+    """Observed state of the pool. Written by the operator."""
 
     observed_generation: int | None = None
-    """The generation of the resource that this status is of."""
+    """Generation of the resource that this status describes."""
     phase: str | None = None
-    """The conditions in one word, for people: Pending, Scaling, Ready, Degraded, Failed, Suspended
-    or Terminating."""
+    """Conditions in one word, for people: Pending, Scaling, Ready, Degraded, Failed, Suspended or
+    Terminating."""
     desired_replicas: Count | None = None
     """Workers wanted, after the bounds."""
     replicas: Count | None = None
@@ -98,35 +100,35 @@ class FiberPoolStatus(Model):
     ready_replicas: Count | None = None
     """Workers that are ready: each has reached its master, or waits for one on purpose."""
     connected_replicas: Count | None = None
-    """Workers that are linked to the master, as its Lease says. Absent where it says nothing."""
+    """Workers that are linked to the master, by its Lease. Absent if the Lease does not say it."""
     pending_replicas: Count | None = None
     """Workers that do not run yet."""
     terminating_replicas: Count | None = None
     """Workers that are being deleted."""
     updated_replicas: Count | None = None
-    """Workers that live and are of the current template."""
+    """Workers that live and have the current template."""
     selector: str | None = None
-    """Selects the pool's pods, for the scale subresource."""
+    """Selector of the pool's pods, for the scale subresource."""
     endpoint: str | None = None
-    """Where the workers dial: the pool's Service."""
+    """Address that the workers dial: the pool's Service."""
     master: str | None = None
     """Address of the master that the endpoint leads to now."""
     master_epoch: Annotated[int | None, Field(ge=0, le=2**53)] = None
-    """The highest epoch that a master of this pool has had. A new master takes a higher one."""
+    """Highest epoch that a master of this pool has had. A new master takes a higher one."""
     idle_since: Time | None = None
-    """Since when the master has asked for no workers, where spec.idle is set."""
+    """Time since which the master has asked for no workers, if spec.idle is set."""
     credentials_secret: str | None = None
-    """Name of the Secret that the master listens with, once it is made and whole."""
+    """Name of the Secret with the master's credentials, once it is complete."""
     template_hash: str | None = None
     """Hash of the current template; the pods' label fiber.dev/template-hash."""
     proven_template_hash: str | None = None
-    """Hash of the last template of which a worker became ready."""
+    """Hash of the last template that gave a ready worker."""
     failures: Failures = Failures()
     problems: Annotated[
         tuple[Problem, ...],
         Field(strict=False, json_schema_extra={"x-kubernetes-list-type": "atomic"}),
     ] = ()
-    """What is wrong, worst first, at most ten."""
+    """Problems, worst first, at most ten."""
     conditions: Annotated[
         tuple[Condition, ...],
         Field(
@@ -138,9 +140,9 @@ class FiberPoolStatus(Model):
 
     @classmethod
     def salvage(cls, document: object) -> tuple[FiberPoolStatus, tuple[str, ...]]:
-        """What can be read of ``document``, and what is wrong with the rest, naming each field.
+        """Return the readable part of ``document``, and the errors of the rest, naming each field.
 
-        Never raises: a status is what the operator remembers, and it goes on with less.
+        Never raises: the status is the operator's memory, and it goes on with less.
         """
         complaints: tuple[str, ...] = ()
         rest, before = document, None
@@ -155,7 +157,8 @@ class FiberPoolStatus(Model):
 
 
 def _to_item(location: _Path) -> _Path:
-    """``location``, or the innermost list item that it is in: half an item is no use."""
+    """Return ``location``, or the innermost list item that it is in, since half an item is of no
+    use."""
     for end in range(len(location), 0, -1):
         if isinstance(location[end - 1], int):
             return location[:end]
@@ -163,7 +166,7 @@ def _to_item(location: _Path) -> _Path:
 
 
 def _without(document: object, locations: set[_Path]) -> object:
-    """``document`` less what is at ``locations``."""
+    """Return ``document`` without what is at ``locations``."""
     if () in locations:
         return {}
     if isinstance(document, Mapping):

@@ -1,7 +1,7 @@
-"""The pod template of a pool: opaque, but for what makes it the template of a worker.
+"""Pod template of a pool: opaque, except for the parts that make it the template of a worker.
 
-The pod's own schema is left to the API server, which judges a pod of the template in a dry run:
-copied into this one it would make a megabyte, out of date with the next release of Kubernetes.
+The pod's own schema is left to the API server, which judges a pod of the template in a dry run. A
+copy of that schema would make a megabyte, and be out of date with the next release of Kubernetes.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class _Container(Model):
 
 
 class _PodSpec(Model):
-    """The pod's spec, as in any pod."""
+    """Pod's spec, as in any pod."""
 
     OPAQUE: ClassVar = True
 
@@ -45,13 +45,13 @@ class _PodSpec(Model):
             json_schema_extra={**LIST_AS_MAP, "x-kubernetes-list-map-keys": ["name"]},
         ),
     ]
-    """The containers, as in any pod. The one that spec.workerContainer names runs Fiber's agent."""
+    """Containers, as in any pod. The one that spec.workerContainer names runs Fiber's agent."""
     restart_policy: Annotated[str | None, Field(max_length=20)] = None
     """Never, or left out."""
 
 
 class _PodTemplate(Model):
-    """A pod template, as in a Deployment: its metadata and its spec."""
+    """Pod template, as in a Deployment: its metadata and its spec."""
 
     OPAQUE: ClassVar = True
 
@@ -74,9 +74,9 @@ Template = Annotated[
     BeforeValidator(_checked_template),
     WithJsonSchema(flat_schema(_PodTemplate)),
 ]
-"""A pod template as it came, with everything that the API server may know and Fiber does not."""
+"""Pod template as it came, with all fields that the API server may know and Fiber does not."""
 
 
 def container_names(template: Mapping[str, Any]) -> list[str]:
-    """The names of the containers in a ``Template``, in its order."""
+    """Return the names of the containers in a ``Template``, in its order."""
     return [container["name"] for container in template["spec"]["containers"]]

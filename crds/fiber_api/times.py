@@ -1,4 +1,4 @@
-"""Points in time: unix seconds in Python, RFC 3339 in the API.  Standard library only."""
+"""Points in time: unix seconds in Python, RFC 3339 in the API. Standard library only."""
 
 from __future__ import annotations
 
@@ -6,16 +6,17 @@ import datetime
 
 EARLIEST = datetime.datetime.min.replace(tzinfo=datetime.UTC).timestamp()
 LATEST = datetime.datetime.max.replace(tzinfo=datetime.UTC, microsecond=0).timestamp()
-"""The first and the last second that can be written."""
+"""First and last second that can be written."""
 
 
 def parse_time(text: str) -> float:
-    """The unix seconds of ``2026-11-21T14:56:13Z`` or its like; else ``ValueError``."""
+    """Return the unix seconds of ``2026-11-21T14:56:13Z`` and the like; else raise
+    ``ValueError``."""
     try:
         moment = datetime.datetime.fromisoformat(text)
         if moment.tzinfo is None:
             raise ValueError
-        # One of the year 10000 in UTC could be read and never be written.
+        # A time of the year 10000 in UTC could be read and never be written.
         return moment.astimezone(datetime.UTC).timestamp()
     except (ValueError, OverflowError):
         raise ValueError(f"{text!r} is no time such as 2026-11-21T14:56:13Z") from None
@@ -28,9 +29,9 @@ def format_micro_time(seconds: float) -> str:
 
 
 def format_time(seconds: float) -> str:
-    """The same in the API's words, in UTC, to the second below.
+    """Return the time in the API's words, in UTC, rounded down to the second.
 
-    What is before the year 1 or after 9999 is written as the first or the last second between.
+    A time before the year 1 or after 9999 becomes the first or the last second between.
     """
     seconds = min(max(seconds, EARLIEST), LATEST)
     moment = datetime.datetime.fromtimestamp(seconds // 1, datetime.UTC)

@@ -1,7 +1,7 @@
-"""FiberPool in fiber.dev/v1alpha1: the one definition of what may stand in it.
+"""FiberPool in fiber.dev/v1alpha1: the only definition of its fields.
 
 The schema that the API server enforces is generated from these models (``schema.py``), docstrings
-and rules included; the operator and the tests read resources with them.  Lists are tuples and
+and rules included. The operator and the tests read resources with them. Lists are tuples and
 everything is frozen: a pool that was read is a value.
 """
 
@@ -40,7 +40,7 @@ _DAY = 86_400
 
 
 class InvalidPool(ValueError):
-    """A resource that cannot be understood; ``errors`` say why, each naming its field."""
+    """Resource that cannot be understood; ``errors`` give the reasons, each naming its field."""
 
     def __init__(self, errors: tuple[str, ...]) -> None:
         super().__init__("; ".join(errors))
@@ -52,7 +52,7 @@ class InvalidPool(ValueError):
 ObjectName = Annotated[
     str, Field(min_length=1, max_length=253, pattern=r"^[a-z0-9]([-a-z0-9.]*[a-z0-9])?$")
 ]
-"""The name of an object of Kubernetes."""
+"""Name of an object of Kubernetes."""
 
 
 def _is_reachable(host: str) -> bool:
@@ -72,8 +72,8 @@ def _is_reachable(host: str) -> bool:
 
 
 def _unchanged(field: str) -> str:
-    """CEL: an optional field is as it was.  ``self.?field`` would be shorter; the API server takes
-    it for too expensive."""
+    """Return CEL for an optional field that did not change. ``self.?field`` would be shorter, but
+    the API server takes it for too expensive."""
     return (
         f"has(self.{field}) == has(oldSelf.{field})"
         f" && (!has(self.{field}) || self.{field} == oldSelf.{field})"
@@ -81,8 +81,8 @@ def _unchanged(field: str) -> str:
 
 
 class Master(Model):
-    """The program that uses the pool. Written by the SDK when it attaches; absent in a warm pool
-    that waits for one."""
+    """Program that uses the pool. Written by the SDK when it attaches; absent in a warm pool that
+    waits for one."""
 
     RULES: ClassVar = (
         Rule(
@@ -116,36 +116,36 @@ class Master(Model):
     port: Annotated[int, Field(ge=1, le=65535)]
     """TCP port that the master listens at."""
     epoch: Annotated[int, Field(ge=1, le=2**53)]
-    """Which master this is: higher with every new one, and never lower than before."""
+    """Number of this master: higher with every new one, and never lower than before."""
     identity: Annotated[str, Field(min_length=1, max_length=253)]
-    """Who holds the pool, for people and for the next one who wants it, such as laptop-7:4711."""
+    """Name of the pool's holder, for people and for the next program, such as laptop-7:4711."""
     lease_name: ObjectName | None = None
-    """Name of the Lease in this namespace that the master renews. Left out, nobody checks whether
-    the master is alive."""
+    """Name of the Lease in this namespace that the master renews. Left out, the master counts as
+    alive without a check."""
     lease_duration_seconds: Annotated[int, Field(ge=5, le=3600)] = 30
-    """The master counts as lost when its Lease was not renewed, or not there, for so long. It
-    renews it every third of this."""
+    """Seconds after which the master counts as lost if its Lease was not renewed, or does not
+    exist. It renews it every third of this."""
     lost_grace_seconds: Annotated[int, Field(ge=0, le=_DAY)] = 60
-    """How long the workers and the pool outlive a lost master, so that it may come back."""
+    """Seconds that the workers and the pool outlive a lost master, so that it may come back."""
 
 
 class Idle(Model):
-    """When a master that is alive is taken to have been forgotten."""
+    """Policy for a master that is alive and may have been forgotten."""
 
     timeout_seconds: Annotated[int, Field(ge=1, le=30 * _DAY)]
-    """A master whose replicas was 0 for so long does not hold minReplicas either. Without a master
-    minReplicas is kept."""
+    """Seconds after which a master whose replicas was 0 no longer holds minReplicas. Without a
+    master minReplicas is kept."""
 
 
 PodName = Annotated[str, Field(min_length=1, max_length=63)]
 
 
 class ScaleDown(Model):
-    """How the pool gets smaller."""
+    """Policy for making the pool smaller."""
 
     policy: Literal["ReleasedOnly", "Any"] = "ReleasedOnly"
-    """ReleasedOnly: a ready worker goes only when the master has released it by name, so that no
-    running task is lost. Any: the operator chooses; for pools that are scaled by kubectl or an
+    """ReleasedOnly: a ready worker is deleted only when the master has released it by name, so that
+    no running task is lost. Any: the operator chooses; for pools that are scaled by kubectl or an
     autoscaler."""
     release: Annotated[
         tuple[PodName, ...],
@@ -158,11 +158,11 @@ class ScaleDown(Model):
     """Names of pods that the master has fenced and no longer needs; the operator deletes them.
     Written by the SDK."""
     idle_timeout_seconds: Annotated[int, Field(ge=0, le=_DAY)] = 60
-    """How long a worker may be idle before the SDK releases it."""
+    """Seconds that a worker may be idle before the SDK releases it."""
 
 
 class ScaleUp(Model):
-    """How the pool gets larger."""
+    """Policy for making the pool larger."""
 
     max_in_flight: Annotated[int, Field(ge=1, le=5000)] = 200
     """Pods that are created at once, at most. The operator begins with one and doubles as long as
@@ -170,9 +170,9 @@ class ScaleUp(Model):
 
 
 class FailurePolicy(Model):
-    """What follows when workers fail: exit with another code than 0, or run out of memory. Workers
-    that the cluster ends (eviction, preemption, a lost node) are replaced at once and not
-    counted."""
+    """Policy for workers that fail: exit with another code than 0, or run out of memory. Workers
+    that the cluster ends (eviction, preemption, a lost node) are replaced at once and not counted.
+    """
 
     RULES: ClassVar = (
         Rule(
@@ -186,31 +186,31 @@ class FailurePolicy(Model):
     )
 
     backoff_base_seconds: Annotated[int, Field(ge=1, le=3600)] = 5
-    """How long to wait before workers that failed are replaced. Doubled with each wave of failures,
-    until a new worker is ready for a minute."""
+    """Seconds before failed workers are replaced. Doubled with each wave of failures, until a new
+    worker is ready for a minute."""
     backoff_max_seconds: Annotated[int, Field(ge=1, le=_DAY)] = 300
-    """The longest wait between two waves."""
+    """Longest wait between two waves."""
     backoff_limit: Annotated[int, Field(ge=0, le=10_000)] = 6
-    """With more waves of failures in a row than this, at none of which half of the workers wanted
-    had been ready for a minute, nothing more is created until template, processesPerPod,
-    failurePolicy, update or suspend changes, or a master with a new epoch comes."""
+    """Waves of failures in a row, at none of which half of the workers wanted had been ready for a
+    minute. After more than this no pod is created until template, processesPerPod, failurePolicy,
+    update or suspend changes, or a master with a new epoch comes."""
     startup_timeout_seconds: Annotated[int, Field(ge=1, le=_DAY)] = 900
-    """How long a worker may take to become ready once its container runs. Then it counts as
+    """Seconds that a worker may take to become ready once its container runs. Then it counts as
     failed: its pod is deleted, and replaced like that of any other failure. A pod whose container
-    does not run yet is kept, however long that takes; this long after its creation it is an Error
-    in the status that no node takes it, or that it does not start."""
+    does not run yet is always kept. This long after its creation, the status has an Error that no
+    node takes it, or that it does not start."""
 
 
 class Update(Model):
-    """How pods of an older template are replaced."""
+    """Policy for replacing pods of an older template."""
 
     strategy: Literal["OnIdle", "Recreate", "OnDelete"] = "OnIdle"
-    """OnIdle: when the master releases them. Recreate: all at once, now. OnDelete: when somebody
-    deletes them."""
+    """OnIdle: when the master releases them. Recreate: all at once, now. OnDelete: when they are
+    deleted."""
 
 
 class FiberPoolSpec(Model):
-    """What is wanted."""
+    """Wanted state of the pool."""
 
     RULES: ClassVar = (
         Rule(
@@ -253,9 +253,9 @@ class FiberPoolSpec(Model):
     """Workers wanted now. Held between minReplicas and maxReplicas. Written by the SDK or by
     kubectl scale: leave it out of manifests that are applied again and again."""
     min_replicas: Annotated[int, Field(ge=0, le=100_000)] = 0
-    """Workers that are kept even when there is nothing to do."""
+    """Workers that are kept even without work."""
     max_replicas: Annotated[int, Field(ge=1, le=100_000)] = 1000
-    """Workers that there may be at most, whatever replicas says."""
+    """Most workers, also if replicas is higher."""
     min_available: Annotated[int, Field(ge=1, le=100_000)] | None = None
     """Workers that a drain of nodes leaves ready, at least: the operator makes a
     PodDisruptionBudget. Left out, there is none."""
@@ -264,19 +264,19 @@ class FiberPoolSpec(Model):
     processes_per_pod: Annotated[int, Field(ge=1, le=1024)] = 1
     """Processes that each worker's agent runs side by side."""
     template: Template
-    """The pod that a worker runs in, as in a Deployment's template. Its fields win over what Fiber
-    adds."""
+    """Pod that a worker runs in, as in a Deployment's template. Its fields win over those that
+    Fiber adds."""
     worker_container: Annotated[str, Field(min_length=1, max_length=63)] = names.WORKER_CONTAINER
     """Name of the container that runs Fiber's agent and by which a worker is judged. Cannot be
     changed."""
     master: Master | None = None
     on_lost: Literal["Delete", "ScaleToMin", "Retain"] = "ScaleToMin"
-    """What becomes of the pool when its master is lost: Delete deletes it with everything it has,
-    ScaleToMin goes back to minReplicas, Retain changes nothing."""
+    """Action when the master is lost: Delete deletes the pool with all its objects, ScaleToMin goes
+    back to minReplicas, Retain changes nothing."""
     idle: Idle | None = None
     credentials_secret_name: ObjectName | None = None
-    """Name of a Secret in this namespace with the credentials that the workers take, made by
-    whoever made the pool. Left out, the operator makes one. Cannot be changed."""
+    """Name of a Secret in this namespace with the workers' credentials, made by the pool's maker.
+    Left out, the operator makes one. Cannot be changed."""
     scale_down: ScaleDown = ScaleDown()
     scale_up: ScaleUp = ScaleUp()
     failure_policy: FailurePolicy = FailurePolicy()
@@ -287,7 +287,7 @@ class FiberPoolSpec(Model):
 
 
 class Metadata(Model):
-    """What the operator needs of an object's metadata."""
+    """Part of an object's metadata that the operator needs."""
 
     name: Annotated[str, Field(min_length=1)]
     namespace: str = ""
@@ -318,7 +318,8 @@ class FiberPool(Model):
         ),
         Rule(
             "spec.master.epoch",
-            # While a master is there its own rules hold; of one that comes nothing is there before.
+            # A present master's own rules hold; before a new one there is no object to compare
+            # with.
             "has(oldSelf.spec.master) || !has(self.spec.master) || !has(self.status)"
             " || !has(self.status.masterEpoch)"
             " || self.spec.master.epoch > self.status.masterEpoch",
@@ -341,15 +342,15 @@ class FiberPool(Model):
 
     @property
     def unread(self) -> tuple[str, ...]:
-        """What was wrong in the status that this was read from, and was left out."""
+        """Errors of the status that this was read from, which were left out."""
         return self._unread
 
     @classmethod
     def read(cls, document: object) -> FiberPool:
-        """The resource in the API's JSON.
+        """Return the resource in the API's JSON.
 
-        Raises ``InvalidPool``, and nothing else, if the spec cannot be understood.  What cannot
-        be understood in the status is left out and told in ``unread``.
+        Raises only ``InvalidPool``, if the spec cannot be understood. The parts of the status that
+        cannot be understood are left out and reported in ``unread``.
         """
         unread: tuple[str, ...] = ()
         try:
@@ -364,10 +365,10 @@ class FiberPool(Model):
 
     @property
     def wanted(self) -> int:
-        """``replicas`` between the bounds."""
+        """Return ``replicas`` between the bounds."""
         return max(self.spec.min_replicas, min(self.spec.max_replicas, self.spec.replicas))
 
     @property
     def credentials_secret(self) -> str:
-        """The Secret that the workers take their credentials from."""
+        """Return the name of the Secret with the workers' credentials."""
         return self.spec.credentials_secret_name or names.secret_name(self.metadata.name)
