@@ -1,23 +1,23 @@
-# One target per chore. Everything happens in .venv, which the first target makes.
+# One target for each task. All of them use .venv, which the first one makes.
 
 PYTHON ?=
 BACKEND ?= local
 VENV := .venv
 BIN := $(VENV)/bin
-# Side by side, and more than there are processors, since some tests wait for what they started. A
-# file's tests stay together: what they share is made once for it.
+# More tests at a time than processors, since some tests wait for the processes that they started.
+# The tests of a file stay together, so that their fixtures are made once.
 FAST_TESTS := tests/contract tests/simulation tests/unit
 SIDE_BY_SIDE := -q -n $(shell echo $$(($$(nproc) * 3 / 2))) --dist loadfile
 FAST := $(BIN)/python -m pytest $(SIDE_BY_SIDE) $(FAST_TESTS)
 WHOLE_PROGRAMS := tests/chart tests/examples tests/faults
-# What depends most on the interpreter: pickling, starting and ending processes, threads and locks.
+# Tests that depend most on the interpreter: pickling, starting and ending processes, threads, locks.
 ESSENTIAL_TESTS := $(patsubst %,tests/unit/test_%.py,connection context loopback pool pool_deaths \
 	process queues reduction synchronize worker exit_functions futures) tests/faults/test_children.py \
 	tests/conformance/test_executors.py
 OTHER_PYTHONS = $(shell .ci/python others $(BIN)/python)
 PARTS = test-prepare test-modules $(addprefix test-python-,$(OTHER_PYTHONS)) test-programs \
 	test-side-by-side
-# The tests start hundreds of interpreters. Without bytecode each compiles all that it imports.
+# The tests start hundreds of interpreters. Without bytecode each would compile all of its imports.
 unexport PYTHONDONTWRITEBYTECODE
 CLUSTER := PYTHONPATH=tests $(BIN)/python -m cluster
 
@@ -31,7 +31,7 @@ help:
 demo: $(VENV)/.with-rl
 	$(BIN)/python examples/02-es/main.py
 
-## make test          every test: all parts run, and the last lines say which of them failed
+## make test          every test; all parts run, and the last lines name those that failed
 test: $(VENV)/.with-dev $(VENV)/.with-stable-baselines3 $(VENV)/.with-jax $(VENV)/.with-testsuite
 	@PYTHONPATH=tests $(BIN)/python -m announcement $(OTHER_PYTHONS)
 	@failed=; \
@@ -48,9 +48,9 @@ test-modules:
 test-programs:
 	$(BIN)/python -m pytest $(SIDE_BY_SIDE) -m "not long" $(WHOLE_PROGRAMS)
 
-# The tests on the cluster wait most of the time, and so do CPython's: side by side they take little
-# longer than the first alone. What the second print is shown at its end. The shell starts them with
-# Ctrl-C ignored, which CPython's tests of signals would inherit.
+# The tests on the cluster wait most of the time, and so do CPython's. Side by side they take little
+# longer than the former alone. The output of CPython's tests is shown at the end. The shell starts
+# background jobs with Ctrl-C ignored, which CPython's tests of signals would inherit; env resets it.
 test-side-by-side:
 	@mkdir -p build; failed=; \
 	setsid env --default-signal=INT,QUIT $(MAKE) --no-print-directory test-conformance \
@@ -68,18 +68,18 @@ test-on-cluster:
 	$(BIN)/python -m pytest -m "not long" \
 		$(addprefix --ignore=,$(FAST_TESTS) $(WHOLE_PROGRAMS) tests/conformance)
 
-## make test-fast     what to run at every save: style, unit, contract, simulation, but for the slowest
+## make test-fast     tests for every save: style, unit, contract, simulation, without the slowest
 test-fast: $(VENV)/.with-dev $(VENV)/.with-stable-baselines3
 	$(FAST) -m "not slow"
 
-## make test-pythons  the essential tests on every other supported Python that is found here
+## make test-pythons  the essential tests on every other supported Python of this machine
 test-pythons: $(VENV)/.made
 	@$(foreach version,$(OTHER_PYTHONS),$(MAKE) --no-print-directory test-python-$(version) &&) true
 
 test-python-%: .venv-%/.with-test
 	.venv-$*/bin/python -m pytest $(SIDE_BY_SIDE) $(ESSENTIAL_TESTS)
 
-## make e2e           all scenarios on a real cluster, the long ones too: KUBECONFIG, kind or our own
+## make e2e           all scenarios on a real cluster, also long ones: KUBECONFIG's, kind's or our own
 e2e: $(VENV)/.with-dev
 	$(CLUSTER) prepare
 	$(BIN)/python -m pytest tests/e2e
@@ -88,18 +88,18 @@ e2e: $(VENV)/.with-dev
 test-long: $(VENV)/.with-dev
 	$(BIN)/python -m pytest -m long tests/faults
 
-## make lint          style, types and import contracts, each tool's own words
+## make lint          style, types and import contracts, with each tool's own output
 lint: $(VENV)/.with-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-## make bench         every measure beside the installed peers; writes docs/benchmarks
+## make bench         every measurement, beside the installed peers; writes docs/benchmarks
 bench: $(VENV)/.with-bench $(VENV)/.with-vector-peers
 	$(BIN)/python -m benchmarks
 
-## make bench-operator  FiberPools beside ReplicaSets at thousands of pretended pods, and floods (root, Go)
+## make bench-operator  FiberPools beside ReplicaSets with thousands of pretended pods; floods (root, Go)
 bench-operator: $(VENV)/.with-dev
 	PYTHONPATH=tests $(BIN)/python -m benchmarks.operator_scale --set-up
 	PYTHONPATH=tests $(BIN)/python -m benchmarks.operator_scale.floods --set-up
@@ -126,16 +126,16 @@ crds: $(VENV)/.with-dev
 images: $(VENV)/.made
 	$(CLUSTER) images
 
-## make cluster       a Kubernetes cluster on this machine, with the images (root, Go), and what a shell
-##                    needs to use it: eval "$(make -s cluster)" has KUBECONFIG, PATH and FIBER_IMAGE
+## make cluster       a Kubernetes cluster on this machine, with the images (root, Go);
+##                    eval "$(make -s cluster)" sets KUBECONFIG, PATH and FIBER_IMAGE in the shell
 cluster: $(VENV)/.made
 	@$(CLUSTER) up --images
 
-## make cluster-down  stops it and deletes what it was
+## make cluster-down  stop that cluster and delete its files
 cluster-down: $(VENV)/.made
 	$(CLUSTER) down
 
-## make clean         remove the environments and what the tools wrote
+## make clean         remove the environments and the files of the tools
 clean:
 	rm -rf $(VENV) .venv-* build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
@@ -143,7 +143,7 @@ clean:
 ##
 ## PYTHON=python3.12 make test    chooses the interpreter of a new .venv; make clean first
 
-# The environment. Each stamp is newer than what its installation was made from.
+# The environment. Each stamp file is newer than the files that its installation was made from.
 $(VENV)/.made:
 	.ci/python make-venv $(VENV) $(PYTHON)
 	touch $@
@@ -155,18 +155,18 @@ $(VENV)/.with-rl $(VENV)/.with-dev $(VENV)/.with-bench: $(VENV)/.made pyproject.
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[$(EXTRAS)]'
 	touch $@
 
-# Without torch, which it needs to learn and is larger than all else together.
+# Without torch, which only learning needs, and which is larger than all other packages together.
 $(VENV)/.with-stable-baselines3: $(VENV)/.with-dev
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps 'stable-baselines3>=2.4'
 	touch $@
 
-# What most often starts threads in a main module. Where it has no wheel, its tests are skipped.
+# JAX starts threads at import most often. Where it has no wheel, its tests are skipped.
 $(VENV)/.with-jax: $(VENV)/.with-dev
 	-$(BIN)/python -m pip install --quiet --disable-pip-version-check --only-binary :all: 'jax>=0.4'
 	touch $@
 
-# Beside which vector environments are measured. Without torch, as above; where one has no wheel the
-# others are measured.
+# Other libraries with vector environments, for the benchmarks. Without torch, as above. A library
+# without a wheel is left out.
 $(VENV)/.with-vector-peers: $(VENV)/.with-bench
 	-$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps 'stable-baselines3>=2.4'
 	-$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps 'pufferlib-core>=3'

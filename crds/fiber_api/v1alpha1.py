@@ -318,8 +318,8 @@ class FiberPool(Model):
         ),
         Rule(
             "spec.master.epoch",
-            # A present master's own rules hold; before a new one there is no object to compare
-            # with.
+            # The master's own rules compare it with the old one. A new master is compared with
+            # the status.
             "has(oldSelf.spec.master) || !has(self.spec.master) || !has(self.status)"
             " || !has(self.status.masterEpoch)"
             " || self.spec.master.epoch > self.status.masterEpoch",

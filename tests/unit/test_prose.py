@@ -31,6 +31,8 @@ RECORDS = sorted((ROOT / "docs" / "decisions").glob("[0-9]*.md"))
 
 def tracked(*patterns: str) -> list[Path]:
     """Return the repository's files that match, without the license."""
+    if not (ROOT / ".git").exists():
+        pytest.skip("the files of the repository are known in a checkout only")
     command = ["git", "ls-files", "-z", *patterns]
     listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
     names = (name for name in listed.split("\0") if name and name != "LICENSE")
