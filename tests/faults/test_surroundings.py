@@ -134,7 +134,7 @@ def test_a_working_directory_that_is_gone(launch_on: Callable[..., Program], fol
     )
     program = launch_on(script, cwd=gone)
     assert program.wait() == 1
-    assert "working directory is this program's, which was deleted" in program.stderr
+    assert "this program's working directory was deleted" in program.stderr
     assert program.left() == []
 
 

@@ -1,9 +1,9 @@
 """Size of messages to workers, and whether a worker gets one ahead.
 
-Pure: numbers in, numbers out.  A message should carry some milliseconds of work, so that its own
-cost hardly counts.  Tasks of a second travel one by one, tasks of a microsecond by the thousand.
-If a message turns out to carry far more work, the worker gives back the tasks that it has not begun
-(``_agent/watchdog.py``).
+Pure: numbers in, numbers out.  A message should carry some milliseconds of work, so that the cost
+of the message hardly counts.  Tasks of a second travel one by one, tasks of a microsecond by the
+thousand.  If a message carries far more work than estimated, the worker gives back the tasks that
+it has not begun (``_agent/worker.py``).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ GROWTH = 8
 """Bound of a message's tasks, as a multiple of the largest message that was measured."""
 
 RESUMED = 64
-"""Tasks of the largest measured message, at first, of a function that ran in earlier jobs."""
+"""Upper bound of ``largest`` at the start of a job whose function ran in earlier jobs."""
 
 LIMIT = 1 << 12
 """Bound of the tasks in one message, however short they are."""
@@ -50,7 +50,7 @@ class TaskPace:
         """Update the estimate: ``tasks`` of them took ``seconds`` together."""
         if not tasks:
             return
-        # One very long task must not make the next thousand travel alone for long.
+        # A bound, so that after one very long task the next thousand do not travel alone for long.
         each = min(max(seconds / tasks, SHORTEST), 4 * SLOW)
         self.seconds = each if self.seconds is None else (self.seconds + each) / 2
         self.largest = max(self.largest, tasks)

@@ -1,4 +1,4 @@
-"""Places of all tasks: the paper's task queue and pending table in one pure object.
+"""Ledger of all tasks: the task queue and the pending table of uber's paper on Fiber.
 
 ::
 
@@ -14,8 +14,8 @@
   in order.  Late and repeated results are ignored; others raise WrongAnswer.
 * A **worker** has at most one batch that it runs and one that it has not read yet.
 
-No clock and no I/O: ``now`` is an argument, the caller sends what ``assign`` returns.  Not
-thread-safe: the executor calls it on its loop's thread.
+Pure: ``now`` is an argument, and the caller sends the batches that ``assign`` returns.  Not
+thread-safe: the executor calls it on the loop thread.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _by_seq = attrgetter("seq")
 class Ledger:
     """Ledger of one pool.
 
-    ``starting``, kept by the caller, is the number of workers that will be added soon.
+    The scheduler sets ``starting``, the number of workers that will be added soon.
     """
 
     def __init__(self) -> None:
@@ -84,9 +84,9 @@ class Ledger:
         """Open a new job; ``limits`` says how often a task of it runs again.
 
         ``unit``: smallest chunk of contiguous tasks in a batch.  ``alone``: each task travels
-        alone, to an idle worker, with no batch queued behind it.  Without retries all tasks do:
-        a crash must not leave in doubt whether another task ran.  ``exact``: results are wanted
-        one by one, and the worker notes each task that it begins.
+        alone, to an idle worker, with no batch queued behind it.  Without retries all tasks do.
+        Otherwise it would be unknown after a crash which tasks had run.  ``exact``: results are
+        wanted one by one, and the worker notes each task that it begins.
         """
         job = Job(owner, pace or TaskPace(), limits, unit, alone, exact)
         self.jobs.add(job)

@@ -101,7 +101,7 @@ class Placement(Generic[Agent, Child]):
         return child, agent
 
     def ended(self, agent: Agent, now: float) -> None:
-        """Take note that one of the agent's children is gone."""
+        """Note that one of the agent's children is gone."""
         self._change(agent, -1)
         if not self.loads[agent]:
             self.idle[agent] = now

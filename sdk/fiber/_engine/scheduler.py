@@ -5,15 +5,15 @@
     submit, feed, cancel ─┐                       ┌─► assign    batches to send
     ready, receive ───────┼─► Ledger, WorkerSet ──┼─► recall    workers to ask for unread batches
     gone, expire ─────────┘       decide(now)     ├─► start     workers to start
-    close, terminate                              ├─► dismiss   workers to tell to end
+    close, terminate                              ├─► dismiss   workers to ask to end
                                                   ├─► end       workers to end at once
                                                   ├─► failed    jobs that cannot run, and why
                                                   └─► wake_at   when to ask again at the latest
 
 An event only changes the state.  ``decide`` returns everything that follows from the state.  So no
-event can forget to send a batch, to replace or dismiss a worker, or to end a pool without work.  No
-clock, no thread, no socket.  Not thread-safe: the executor (``fiber._runtime.executor``) calls it
-on one thread.
+event can forget to send a batch, to replace or dismiss a worker, or to end a pool without work.
+Pure: ``now`` is an argument.  Not thread-safe: the executor (``fiber._runtime.executor``) calls it
+on the loop thread.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class Scheduler:
         self.workers.add(member)
 
     def ready(self, member: PoolMember, now: float) -> None:
-        """Take note that a worker is ready; ignored if it was asked to end, or is gone."""
+        """Note that a worker is ready; ignored if it was asked to end, or is gone."""
         if member in self.workers.members and not member.leaving and member.worker is None:
             self.workers.ready(member, self.ledger.add(member, now, self._max_tasks))
 

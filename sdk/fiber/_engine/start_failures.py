@@ -1,4 +1,4 @@
-"""Times to try a start again, and to give up, after failed starts of workers or agents.
+"""Decisions after failed starts of workers or agents: when to try again, when to give up.
 
 Pure: ``now`` is an argument.
 """
@@ -11,8 +11,8 @@ from typing import NamedTuple
 from fiber.errors import FiberError, StartError
 
 RAISED_PATIENCE = 1.0
-"""Seconds for which processes may fail to start by their own fault, such as an initializer that
-raises, before the failure is final."""
+"""Seconds for which the processes' errors, such as an initializer that raises, may prevent starts
+before the failure is final."""
 
 KILLED_PATIENCE = 10.0
 """Seconds for which starting processes may be killed, or refused by the system, before the failure
@@ -42,7 +42,7 @@ class StartFailure(NamedTuple):
     """True if a signal ended it, or the system had no room for it: it may not be at fault."""
     cause: BaseException | None = None
     final: FiberError | None = None
-    """Error that keeps every process from starting: another try is of no use."""
+    """Error that no process will start without a remedy: another try is of no use."""
 
     def error(self, attempts: int) -> FiberError:
         """Return the error that the user gets."""
@@ -63,7 +63,7 @@ class StartFailures:
         self.count = 0
         self.pause = 0.0
         self._since = 0.0
-        self._raises = 0  # failures by the processes' own fault
+        self._raises = 0  # failures by errors of the processes
         self._raising_since = 0.0
         self._wave_at = 0.0
         self._said = False

@@ -56,7 +56,7 @@ class Charges:
 
 
 COMPACT = 1024
-"""Given-out items at the front of a growing list above which the list is trimmed."""
+"""Number of items at the front of a growing list that may be given out before they are removed."""
 
 
 class Span:
@@ -99,7 +99,7 @@ class Span:
 
 
 class _Stock:
-    """Span that is given out from its front, and grows at its end while tasks come in."""
+    """Tasks that are given out from the front, and added at the end."""
 
     __slots__ = ("alone", "items", "position", "start")
 
@@ -119,7 +119,7 @@ class _Stock:
         return span
 
     def grow(self, span: Span) -> bool:
-        """Append ``span`` if it fits on without a copy of the items; return whether it does."""
+        """Append ``span`` if that needs no copy of the items; return False if it does."""
         if (
             not isinstance(self.items, list)
             or self.alone != span.alone
@@ -167,7 +167,7 @@ class WaitingTasks:
             self._stocks.append(_Stock(span))
 
     def appendleft(self, span: Span) -> None:
-        """Add tasks that come back ahead of all others."""
+        """Add tasks that were given out before, ahead of all others."""
         self._count += len(span.items)
         self._stocks.appendleft(_Stock(span))
 
@@ -185,7 +185,7 @@ RunningTask = tuple[int, int]
 """Task that a worker runs: the number of its batch, and its offset in the batch."""
 
 HAD = 16
-"""Number of last batches that a worker may still answer for, once they are over."""
+"""Number of finished batches that a worker may still answer for."""
 
 
 class WrongAnswer(Exception):
@@ -334,7 +334,7 @@ class Batch:
                 f"it sent results {offset} to {stop} of batch {self.seq}, which has {size} tasks "
                 f"and {self.received} results"
             )
-        # A worker that keeps none could have its tasks run again without end, uncharged.
+        # If a worker kept none, its tasks could run again without end, and without a charge.
         if kept is not None and not max(stop, 1) <= kept <= size:
             raise WrongAnswer(f"it kept {kept} of {size} tasks of batch {self.seq}, {stop} done")
         self._received_from, self.received = offset, stop

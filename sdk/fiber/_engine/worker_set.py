@@ -97,7 +97,7 @@ class PoolWorkerSet:
         self.starting += 1
 
     def ready(self, member: PoolMember, worker: WorkerEntry) -> None:
-        """Take note that a worker is ready."""
+        """Note that a worker is ready."""
         member.worker = worker
         self.starting -= 1
         self._failures.forget()
@@ -106,14 +106,14 @@ class PoolWorkerSet:
             self._failures.pause = 0.0
 
     def did_something(self) -> None:
-        """Take note that a worker sent a result."""
+        """Note that a worker sent a result."""
         if self._idle_deaths:
             self._idle_deaths = 0
             if not self.failures:
                 self._failures.pause = 0.0
 
     def give_up(self, error: FiberError) -> None:
-        """Take note that no more workers can start, because of ``error``."""
+        """Note that no more workers can start, because of ``error``."""
         self.error = error
 
     def let_go(self, member: PoolMember) -> None:

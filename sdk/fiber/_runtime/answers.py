@@ -20,7 +20,7 @@ from fiber._wire.packet import Message
 
 
 class TaskFailure:
-    """The task raised, or could not run."""
+    """Outcome of a task that raised ``error``, or that could not run."""
 
     __slots__ = ("error",)
 
@@ -29,7 +29,7 @@ class TaskFailure:
 
 
 class Pickled:
-    """A value or an error, still pickled."""
+    """Outcome of a task, a value or an error, that is still pickled."""
 
     __slots__ = ("buffers", "data", "kind")
 
@@ -44,7 +44,7 @@ class Pickled:
         return self.kind != work.VALUE
 
     def decode(self) -> Any:
-        """Return the value, or the Failure."""
+        """Return the value, or a TaskFailure."""
         try:
             value = pickle.loads(self.data, buffers=self.buffers)
         except Exception as error:
@@ -59,14 +59,14 @@ def is_failure(outcome: Any) -> bool:
 
 
 def decode(outcome: Any) -> Any:
-    """A plain value as it is; what is pickled as its value or a Failure."""
+    """Return the value of an outcome, or a TaskFailure."""
     return outcome.decode() if type(outcome) is Pickled else outcome
 
 
 def outcomes(
     values: list[Any], odd: list[tuple[int, int, bytes | None, int]], buffers: list[memoryview]
 ) -> list[Any]:
-    """A worker's answer with what is pickled in its place; ValueError if it does not fit."""
+    """Put the pickled values of an answer in their places; ValueError if they do not fit."""
     used = 0
     for position, kind, data, count in odd:
         if not (0 <= position < len(values) and 0 <= count <= len(buffers) - used):
@@ -95,11 +95,11 @@ _UNREADABLE = _Unreadable()
 
 
 Words: TypeAlias = tuple[Any, ...]
-"""Content of a worker's message.  Results are (seq, offset, kept, seconds, values, mixed, size):
-among the values, if they are mixed, are ``Pickled`` ones; ``size`` is that of the message."""
+"""Content of a worker's message.  Results are (seq, offset, kept, seconds, values, mixed, size).
+``mixed``: some values are ``Pickled``.  ``size``: bytes of the message."""
 
 OTHER = object()
-"""Mark in place of a result: the message is something else."""
+"""Mark in place of a result: the message is another one."""
 
 
 def single(message: Message, seq: int) -> Any:
@@ -114,9 +114,9 @@ def single(message: Message, seq: int) -> Any:
 
 
 def read(message: Message) -> Words:
-    """Read a message; anything but results stays as ``fiber._wire.work`` has it.
+    """Read and check a message.  All but results keep the form of ``fiber._wire.work``.
 
-    Raises WrongAnswer for what no worker sends.  The message can be read again until its release.
+    Raise WrongAnswer for a message that no worker sends.  It can be read again until its release.
     """
     try:
         words = pickle.loads(message.payload)

@@ -1,4 +1,4 @@
-"""A thread for what the loop must not do: run the user's code, start processes."""
+"""Threads for work that the loop must not do: run the user's code, start processes."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from fiber._exceptions import report_uncaught
 
 
 class BackgroundThread:
-    """Does one thing after the other on a thread of its own, which starts when first needed.
+    """Thread that does one action after the other.  It starts with the first action.
 
-    As ``ThreadPoolExecutor(1)``, with two differences: the thread is a daemon, so that what hangs
-    in it cannot keep the program from ending, and ``stop`` does not wait.  ``submit`` and ``stop``
-    are for the loop's thread, so nothing here needs a lock.  Other threads may ``submit`` once the
-    thread has been started.
+    As ``ThreadPoolExecutor(1)``, with two differences.  The thread is a daemon, so an action that
+    hangs does not keep the program from ending.  And ``stop`` does not wait.  The loop thread calls
+    ``submit`` and ``stop``, so they need no lock.  Other threads may ``submit`` once the thread has
+    started.
     """
 
     def __init__(self, name: str) -> None:
@@ -28,16 +28,16 @@ class BackgroundThread:
         self._stopped = False
 
     def start(self) -> None:
-        """Have the thread now, before anything is submitted.
+        """Start the thread now, before the first action.
 
-        From Python 3.12 on none starts any more once the program ends.
+        From Python 3.12 on no thread starts once the program ends.
         """
         thread = threading.Thread(target=self._run, name=self._name, daemon=True)
         thread.start()
         self._thread = thread
 
     def submit(self, action: Callable[..., object], *args: Any) -> bool:
-        """Have it done, after what came before; False: it has been stopped, and drops it.
+        """Have ``action`` done after those before it; return False if the thread was stopped.
 
         RuntimeError if the system has no room for the thread; the next call tries again.
         """
@@ -53,7 +53,7 @@ class BackgroundThread:
         return threading.current_thread() is self._thread
 
     def stop(self, then: Callable[[], object] | None = None) -> None:
-        """End once everything submitted is done, and call ``then`` at the end."""
+        """End once all submitted actions are done, and call ``then`` at the end."""
         self._stopped = True
         if then is not None and self._thread is None:
             then()
@@ -62,7 +62,7 @@ class BackgroundThread:
         self._queue.put(None)
 
     def join(self) -> None:
-        """Wait until it has ended; nothing when called by what it is doing."""
+        """Wait until the thread has ended.  Return at once if the caller runs on it."""
         thread = self._thread
         if thread is not None and not self.runs_here():
             thread.join()
@@ -73,27 +73,27 @@ class BackgroundThread:
             try:
                 action(*args)
             except BaseException:
-                # Mostly a callback of the user's: it must be seen, and must not end the others.
+                # Mostly a callback of the user's: its error is reported, and the others still run.
                 report_uncaught()
             del entry, action, args
 
 
 def say(news: str) -> None:
-    """Print it.  On a background thread: a slow terminal must not hold up the loop."""
+    """Print news for the user.  Runs on a background thread: a terminal may be slow."""
     print(f"fiber: {news}", file=sys.stderr, flush=True)
 
 
 class UserThreads:
-    """The threads of one pool that run the user's code, by the kind of that code.
+    """Threads of one pool that run the user's code: one thread for each kind of code.
 
-    None of them waits for another one: a callback may wait for a result that is to be unpickled.
+    They are separate because a callback may wait for a result that another thread unpickles.
     """
 
     def __init__(self, thread: Callable[[str], BackgroundThread]) -> None:
         self.pickling = thread("fiber-pool")
         """Pickles tasks, and starts workers."""
         self.unpickling = thread("fiber-pool-results")
-        """Unpickles results that are not unpickled where they are asked for."""
+        """Unpickles results that no caller unpickles on its thread."""
         self.callbacks = thread("fiber-pool-callbacks")
         """Runs the callbacks of results."""
 
@@ -103,7 +103,7 @@ class UserThreads:
             thread.start()
 
     def stop(self) -> None:
-        """End all of them once everything submitted is done."""
+        """End all of them once all submitted actions are done."""
         self.pickling.stop()
         self.unpickling.stop(then=self.callbacks.stop)  # unpickled results have callbacks
 

@@ -1,8 +1,8 @@
-"""The executor: does what a pool's scheduler decides, and tells it what happens.
+"""Executor of a pool: does what the pool's scheduler decides, and reports events to it.
 
 ::
 
-    any thread           the loop's thread                                     worker
+    any thread           loop thread                                           worker
     call, submit, … ───► Jobs ──► Scheduler.decide ──► _act ──► Sender ───────► run
                           ▲                                       │ ▲            │
                           │                  background thread ◄──┘ │            │
@@ -11,11 +11,12 @@
                           │
                           └──► Future.add_results, set_done
 
-Everything that changes happens on the loop's thread, one thing at a time: no lock guards it.  Who
-asks for something, in whatever thread, finalizer or signal handler, puts it into the loop's queue
-and wakes the loop; nothing of the asker's can be left half done, and nothing can deadlock.  Nothing
-on the loop's thread runs the user's code: a batch whose pickling could goes to the background
-thread, values whose unpickling could stay ``Pickled``.
+The state changes on the loop thread alone, one event at a time, so no lock guards it.  A request
+may come from any thread, finalizer or signal handler.  It goes into the loop's queue, and wakes the
+loop.  So an interrupted caller leaves no state half changed, and requests cannot deadlock.
+
+The loop thread never runs the user's code.  If pickling a batch may run some, the batch goes to the
+background thread.  If unpickling a value may run some, the value stays ``Pickled``.
 """
 
 from __future__ import annotations
@@ -57,14 +58,14 @@ from fiber.errors import FiberError
 
 
 class Waitable(Future, Protocol):
-    """A future to wait for."""
+    """Future that a thread can wait for."""
 
     def get(self) -> Any:
-        """Wait for the result, or the exception."""
+        """Wait for the result and return it, or raise the exception of the call."""
 
 
 class PoolExecutor:
-    """The working half of a pool; ``fiber.pool.Pool`` is its face, and may be forgotten first."""
+    """Working half of a pool.  It goes on if the user drops the ``Pool`` while tasks run."""
 
     def __init__(
         self,
@@ -127,22 +128,22 @@ class PoolExecutor:
             refusal=self._refusal,
             advance=self._advance,
         )
-        """The calls of single functions."""
+        """Queues of single calls."""
         self._wake: LoopTimer | None = None
         self._ended_by: BaseException | None = None
         """Error of calls that are not done when the pool is terminated."""
         self._acting = False
         self._again = False
 
-    # What is asked of it, on any thread
+    # Requests, on any thread
 
     def start(self) -> None:
-        """Start the first workers; raises what stands in the way of one.
+        """Start the first workers; raise the error if one cannot be started.
 
-        Where hosts are made for them, they start with the first task.
+        Where hosts are made for workers, they start with the first task instead.
         """
         try:
-            if self.options.calls_back_at_end:  # when no thread could be started any more
+            if self.options.calls_back_at_end:  # after the program's end no thread starts
                 self.threads.start()
             self._loop.depend(self)
         except BaseException:
@@ -150,7 +151,7 @@ class PoolExecutor:
             raise
         if self._elastic:
             self._runtime.look_at_program()
-            return  # the first task says what they need, and starts them
+            return  # the first task chooses their resources, and starts them
         handles = self._launcher.make(self, self.options.minimum)
         try:
             self._loop.call_soon(self._begin, handles)
@@ -162,7 +163,7 @@ class PoolExecutor:
             raise
 
     def start_workers(self) -> None:
-        """Start the first workers if the first task would."""
+        """Start the first workers now, where the first task would start them."""
         self._loop.call_soon(self._advance)
 
     def choose_resources(self, function: Callable[..., Any]) -> None:
@@ -182,7 +183,7 @@ class PoolExecutor:
         timeout: float | None = None,
         queue: CallQueue | None = None,
     ) -> None:
-        """Submit a call.  ``queue`` has options of several calls, ``timeout`` is its own."""
+        """Submit a call.  ``queue`` has options of several calls, ``timeout`` is for this one."""
         call = pickle_call(future, function, args, kwargs, self.reject)
         if call is None:
             return
@@ -198,7 +199,7 @@ class PoolExecutor:
         kwargs: Mapping[str, Any],
         timeout: float | None = None,
     ) -> Any:
-        """The result of one call, which this thread waits for, or its exception."""
+        """Submit a call and wait for it; return its result or raise its exception."""
         direct = timeout is None and self._leases_workers
         call = pickle_call(future, function, args, kwargs, self.reject, blocking=direct)
         if call is None:
@@ -222,32 +223,32 @@ class PoolExecutor:
             self._loop.call_soon(self._take, item, (call,))
 
     def broadcast(self, future: Future, function: Callable[..., Any], args: Sequence[Any]) -> None:
-        """The same call on every worker, present or starting; an outcome of each."""
+        """Submit a call to every worker, ready or starting; ``future`` gets an outcome of each."""
         call = pickle_call(future, function, args, {}, self.reject)
         if call is not None:
             self._check()
             self._loop.call_soon(self._broadcast, WorkItem(work.CALLS, future=future), call)
 
     def reject(self, future: Future, error: BaseException) -> None:
-        """Fail ``future``, whose call cannot begin.  It is set on the loop's thread, as always."""
+        """Fail ``future``, whose call cannot begin.  The loop thread sets it, as always."""
         self._check()
         self._loop.call_soon(future.set_exception, error)
 
     def function(self, function: Callable[..., Any]) -> Function:
-        """``function``, pickled; one that pickles as an earlier one did is the same."""
+        """Return ``function``, pickled.  Equal pickles are the same Function."""
         return self._functions.get(function)
 
     def submit(self, item: WorkItem, tasks: Sequence[Any]) -> None:
-        """Run all of ``tasks``, which must not change until they are done."""
+        """Run all of ``tasks``.  The sequence must not change until they are done."""
         self._check()
         self._loop.call_soon(self._take, item, tasks)
 
     def open_stream(
         self, item: WorkItem, limit: int | None = None, consumed: Callable[[], int] = lambda: 0
     ) -> InputStream:
-        """Run what the stream will read; to be ended by ``finish`` or ``cancel``.
+        """Run the tasks that the stream will read; the caller ends it by ``finish`` or ``cancel``.
 
-        ``limit``: tasks read and not ``consumed``, at most.
+        ``limit``: largest number of tasks that are read and not ``consumed``.
         """
         self._check()
         loop = self._loop
@@ -257,7 +258,7 @@ class PoolExecutor:
         return stream
 
     def read(self, item: WorkItem, iterable: Iterable[Any]) -> None:
-        """Read its stream's input on a thread of its own, and finish it."""
+        """Read the input of an item's stream on a new thread, and finish the stream."""
         self._loop.call_soon(self._start_reading, item, iterable)
 
     def finish(self, item: WorkItem, error: BaseException | None = None) -> None:
@@ -272,7 +273,7 @@ class PoolExecutor:
         self._loop.call_soon(self._cancel, item)
 
     def resume(self, item: WorkItem) -> None:
-        """Results of it are read again, after its future had asked for no more."""
+        """Run further tasks of ``item``: its results are read again after a pause."""
         self._loop.call_soon(self._resume, item)
 
     def cancel_all(self, error: BaseException) -> None:
@@ -280,36 +281,39 @@ class PoolExecutor:
         self._loop.call_soon(self._cancel_all, error)
 
     def close(self) -> None:
-        """Take no more requests; the workers leave once those that are there are done."""
+        """Take no more requests.  The workers end once the present requests are done."""
         self._loop.call_soon(self._close)
 
     def terminate(self, error: BaseException) -> None:
-        """End the workers now; ``error`` is what those hear who wait for a result."""
+        """End the workers now.  Callers that wait for a result get ``error``."""
         self._loop.call_soon(self._terminate, error)
 
     def join(self) -> None:
-        """Wait until all workers and threads are gone; after ``close`` or ``terminate``."""
+        """Wait until all workers and threads have ended.  Call ``close`` or ``terminate`` first."""
         self._loop.call_soon(self._lift_limits)
         self.ended.wait()
         self.threads.join()
 
     def on_loop(self) -> bool:
-        """Tell whether the caller runs on the loop's thread, which must not wait."""
+        """Tell whether the caller runs on the loop thread, which must not wait."""
         return self._loop.on_thread()
 
     @property
     def error(self) -> BaseException | None:
-        """Why no worker starts, once that is final."""
+        """Error for which no worker starts, once that is final."""
         return self._scheduler.workers.error
 
     def _check(self) -> None:
-        """Refuse at once what can be seen from here to be of no use."""
+        """Raise the error at once if no worker will run a new request."""
         error = self._refusal()
         if error is not None:
             raise fresh(error)
 
     def wait_until_up(self, timeout: float | None) -> bool:
-        """Wait for the first workers; False after ``timeout`` seconds.  Raises why none come."""
+        """Wait for the first workers; return False after ``timeout`` seconds.
+
+        Raise the error if workers cannot start.
+        """
         self.start_workers()
         up = self.workers.wait_until_up(timeout)
         self._check()
@@ -320,10 +324,10 @@ class PoolExecutor:
             return self.error
         return self.options.refusal() if self._scheduler.closing else None
 
-    # Requests.  From here on all happens on the loop's thread.
+    # Requests, on the loop thread.  All that follows runs there.
 
     def _take(self, item: WorkItem, tasks: Sequence[Any] | None) -> None:
-        """A map, a call with a deadline, or (None) a stream."""
+        """Take a map, a call with a time limit, or a stream, for which ``tasks`` is None."""
         refusal = self._refusal()
         if refusal is not None:
             if item.stream is not None:
@@ -346,12 +350,12 @@ class PoolExecutor:
         self._advance()
 
     def _refill(self, item: WorkItem) -> None:
-        """A stream has input, or room."""
+        """Feed the tasks that a stream has read, and let it read on."""
         self._jobs.top_up(item)
         self._advance()
 
     def _start_reading(self, item: WorkItem, iterable: Iterable[Any]) -> None:
-        # Here, since a signal that strikes in Thread.start() leaves an error of its own.
+        # On the loop thread: a signal handler that raises in Thread.start() would break the start.
         if item.stream is not None:
             item.stream.read_on_thread(iterable, partial(self.finish, item))
 
@@ -379,10 +383,10 @@ class PoolExecutor:
         self._jobs.lift_limits()
         self._advance()
 
-    # What follows
+    # Decisions
 
     def _advance(self) -> None:
-        """Do all that follows from what happened."""
+        """Have the scheduler decide, and do what it says, until no decision follows."""
         if self._acting:
             self._again = True
             return
@@ -423,7 +427,7 @@ class PoolExecutor:
             self._end()
 
     def _wake_at(self, due: float) -> None:
-        """Decide again then, if not before."""
+        """Decide again at ``due`` at the latest."""
         if self._wake is not None:
             if self._wake.due <= due:
                 return
@@ -435,14 +439,14 @@ class PoolExecutor:
         self._wake = None
         self._advance()
 
-    # What becomes of batches
+    # Packets of workers
 
     def on_message(self, handle: WorkerHandle, message: Message) -> None:
-        """A packet from a worker."""
+        """Take a packet from a worker."""
         self._receiver.take(handle, message)
 
     def on_recalled(self, handle: WorkerHandle, seqs: list[int]) -> None:
-        """A worker will never see these batches."""
+        """Have the tasks of batches wait again that the worker will never read."""
         self._receiver.recalled(handle, seqs)
 
     def _adopt(self, leased: LeasedWorker, call: Call) -> None:
@@ -478,7 +482,7 @@ class PoolExecutor:
             self._scheduler.starting(handle)
 
     def _never_started(self, handles: Iterable[WorkerHandle], error: BaseException | None) -> None:
-        """Workers whose processes there never were; ``error``: not for want of trying."""
+        """Remove workers that have no process; ``error`` says why, if a start was tried."""
         failure = None
         if error is not None:
             failure = StartFailure("a pool worker", str(error), killed=True, cause=error)
@@ -487,14 +491,14 @@ class PoolExecutor:
         self._advance()
 
     def _ready(self, handle: WorkerHandle) -> None:
-        """A worker is initialized."""
+        """Give tasks to a worker that is initialized."""
         _logs.debug("worker %s is ready", handle.name)
         self._scheduler.ready(handle, self._loop.now())
         self.workers.changed()
         self._advance()
 
     def on_draining(self, handle: WorkerHandle) -> None:
-        """A worker's host is about to go: another takes its place, and what it has not begun."""
+        """Replace a worker whose host is about to end; its unread tasks run elsewhere."""
         if not self._leases.keep_draining(handle) and self._scheduler.drain(handle):
             _logs.debug("worker %s is drained", handle.name)
             if handle.child is not None:
@@ -504,11 +508,11 @@ class PoolExecutor:
         self._advance()
 
     def on_exit(self, handle: WorkerHandle, report: ExitReport) -> None:
-        """A worker is gone, with or without having been told to."""
+        """Remove a worker that has ended, asked or not."""
         if self._leases.keep_exit(handle, report):
             return  # until the caller that uses it puts the lease back
         self._sender.exited(handle, report.stack)
-        # A lost host says nothing of the worker.
+        # The loss of a host is no failure of the worker.
         lost_host = report.disrupted or report.cause == Cause.AGENT_LOST
         failure = None if lost_host else handle.start_failure(report)
         self._lost(handle, failure, report)
@@ -556,7 +560,7 @@ class PoolExecutor:
         self._advance()
 
     def broken(self, error: FiberError) -> None:
-        """The loop has failed: nobody will hear of the workers any more."""
+        """End all: the loop has failed, so no event of the workers will arrive."""
         handles: list[Any] = list(self._scheduler.workers.members)
         self._scheduler.workers.give_up(error)
         self._terminate(error)

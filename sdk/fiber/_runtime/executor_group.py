@@ -1,4 +1,4 @@
-"""The executors behind one ``fiber.Executor``: one for each kind of worker that its tasks need."""
+"""Executors behind one ``fiber.Executor``: one for each kind of worker that its tasks need."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from fiber._runtime.state import Runtime
 from fiber.resources import Resources, merged, resources_of
 
 _EXIT_PRIORITY = 20
-"""Before pools are terminated, which its tasks may use."""
+"""Priority above that of pools, which its tasks may use: it ends first."""
 
 
 class ExecutorGroup:
-    """Starts executors as tasks come, and ends all of them together.
+    """Group of executors that start as tasks come, and end together.
 
-    Where hosts are made for workers, tasks with different wishes have different executors;
-    elsewhere there is one.
+    Where hosts are made for workers, tasks with different wishes have different executors.
+    Elsewhere there is one executor.
     """
 
     def __init__(self, template: PoolOptions, runtime: Runtime) -> None:
@@ -34,17 +34,17 @@ class ExecutorGroup:
         self._runtime = runtime
         self._owner = os.getpid()
         self._executors: dict[Resources, PoolExecutor] = {}
-        self._lock = threading.RLock()  # a finalizer may come back here
+        self._lock = threading.RLock()  # a finalizer may start an executor while one is started
         self._closed = False
-        # Forgotten with tasks under way, it ends after them.
+        # If the user drops the group while tasks run, it ends after these tasks.
         util.Finalize(self, _close_all, args=(self._executors,))
 
     def executor_for(self, function: Callable[..., Any], wishes: Resources) -> PoolExecutor:
         """Return the executor for ``function``; raise an error after shutdown."""
         if os.getpid() != self._owner:
             raise RuntimeError(
-                f"this executor belongs to process {self._owner}: a copy of it that came here by a "
-                "fork has no workers; make an executor in this process"
+                f"this executor belongs to process {self._owner}: its copy in a forked process has "
+                "no workers. Make an executor in this process"
             )
         if self._closed:
             raise refusal()
@@ -72,7 +72,7 @@ class ExecutorGroup:
                     executor.start()
                     self._executors[kind] = executor
                 finally:
-                    if kind not in self._executors:  # interrupted: nobody else would end it
+                    if kind not in self._executors:  # interrupted: the group does not know it
                         executor.close()
             return executor
 
@@ -96,13 +96,13 @@ class ExecutorGroup:
                 executor.join()
 
     def terminate(self) -> None:
-        """End the workers at once; who waits for a result hears so."""
+        """End the workers at once.  Callers that wait for a result get BrokenProcessPool."""
         for executor in self._close():
             executor.terminate(BrokenProcessPool("terminate_workers() ended its worker"))
 
     def _close(self) -> list[PoolExecutor]:
         if os.getpid() != self._owner:
-            return []  # a copy that came here by a fork: nothing is here to end
+            return []  # a copy from a fork has no workers
         with self._lock:
             self._closed = True
             return self.executors()
@@ -118,7 +118,7 @@ def _close_all(executors: dict[Resources, PoolExecutor]) -> None:
 
 
 def _finish(reference: weakref.ref[PoolExecutor]) -> None:
-    """The program ends: once its tasks are done, as in concurrent.futures."""
+    """Wait for the tasks when the program ends, as concurrent.futures does."""
     executor = reference()
     if executor is not None:
         executor.close()

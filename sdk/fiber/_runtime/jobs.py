@@ -28,7 +28,7 @@ and would be set again and again."""
 
 
 class Jobs:
-    """Opens, feeds and ends jobs, and hands their outcomes to futures."""
+    """Opens, feeds and ends jobs, and hands their outcomes to futures.  Runs on the loop thread."""
 
     def __init__(self, ledger: Ledger, limits: Limits, *, retry: bool) -> None:
         self._ledger = ledger
@@ -37,7 +37,7 @@ class Jobs:
         self._streams: dict[WorkItem, None] = {}
 
     def open(self, item: WorkItem) -> Job:
-        """Begin with it."""
+        """Open the job of a work item."""
         function = item.function
         pace = TaskPace(function.pace if function is not None else None)
         if function is not None:
@@ -53,12 +53,12 @@ class Jobs:
         return job
 
     def run(self, item: WorkItem, tasks: Sequence[Any]) -> None:
-        """Begin with all of its tasks."""
+        """Open the job of a work item that has all of its tasks."""
         self._ledger.feed(self.open(item), tasks)
         self.close(item)
 
     def close(self, item: WorkItem) -> None:
-        """No task of it will come any more."""
+        """Close the job of a work item to further tasks."""
         if item.job is not None and item.job.owner is item:
             self._ledger.close(item.job)
             self.check_finished(item.job)
@@ -66,13 +66,13 @@ class Jobs:
     # Streams
 
     def open_stream(self, item: WorkItem) -> None:
-        """Begin with a stream."""
+        """Open the job of a stream."""
         self.open(item)
         self._streams[item] = None
         self.top_up(item)
 
     def top_up(self, item: WorkItem) -> bool:
-        """Take from a stream what was read, and let it read on; whether there was something."""
+        """Feed the tasks that a stream has read, and let it read on; False if there were none."""
         stream, job, ledger = item.stream, item.job, self._ledger
         if item not in self._streams or stream is None or job is None:
             return False
@@ -85,7 +85,7 @@ class Jobs:
         return bool(tasks)
 
     def top_up_all(self, items: Iterable[WorkItem | None]) -> bool:
-        """The same for those of some items that are streams."""
+        """Top up the streams among ``items``; return False if none had tasks."""
         if not self._streams:
             return False
         found = False
@@ -94,7 +94,7 @@ class Jobs:
         return found
 
     def resume(self, item: WorkItem) -> None:
-        """Go on with ``item``, whose results are being read again."""
+        """Run further tasks of ``item``, if its future has room for results again."""
         if item.job is not None and item.future is not None and item.future.has_room():
             self._ledger.pause(item.job, False)
 
@@ -113,7 +113,7 @@ class Jobs:
         """End the stream of ``item``.  An ``error`` takes the place of the next task."""
         job = item.job
         if item not in self._streams or item.stream is None or job is None:
-            return  # failed or cancelled meanwhile
+            return  # it has failed or was cancelled
         self._ledger.feed(job, item.stream.take())
         if error is not None and item.future is not None:
             item.future.add_results(job.fed, [TaskFailure(error)], True)
@@ -125,7 +125,7 @@ class Jobs:
     def put(
         self, receipt: Receipt, results: list[Any], *, mixed: bool = True, size: int = 0
     ) -> None:
-        """Hand results on, ``size`` bytes, but for those whose tasks get another try."""
+        """Hand results of ``size`` bytes to their futures.  Tasks that may retry run again."""
         if mixed and self._retry:
             for at, result in enumerate(results):
                 again = type(result) is Pickled and result.kind == work.AGAIN
@@ -143,13 +143,13 @@ class Jobs:
                 self._ledger.pause(receipt.job, True)
             return
         for task, outcome in enumerate(results, receipt.start):
-            receipt.job.charges.settle(task)  # the job of the calls lasts as long as the pool
+            receipt.job.charges.settle(task)  # the job of calls stays open
             future = receipt.item(task).future
             future.add_results(0, [outcome], mixed)
             future.set_done()
 
     def put_timeout(self, receipt: Receipt, worker: str, stack: str) -> None:
-        """A task took too long; ``stack`` says where it was."""
+        """Fail a task that took too long; ``stack`` says where it was."""
         item: WorkItem = receipt.job.owner
         name = item.task_name(receipt.start, receipt.item(receipt.start))
         lines = [
@@ -163,7 +163,7 @@ class Jobs:
     def put_losses(
         self, losses: list[Loss], worker: str, pid: int | None, report: ExitReport
     ) -> None:
-        """Tasks have killed as many workers as they may."""
+        """Fail the tasks that were running in too many workers when these were lost."""
         for loss in losses:
             item: WorkItem = loss.job.owner
             error = WorkerDied(
@@ -192,7 +192,7 @@ class Jobs:
     # The end
 
     def check_finished(self, job: Job) -> None:
-        """If all is done, say so."""
+        """End a job if all of its tasks are done."""
         item: WorkItem | None = job.owner
         if job.finished and item is not None:
             future = item.future
@@ -215,7 +215,7 @@ class Jobs:
         self._over(item)
 
     def cancel(self, item: WorkItem) -> list[WorkerEntry]:
-        """Drop the rest of ``item``; return the workers to recall its unread tasks from."""
+        """Drop the rest of ``item``; return the workers whose unread tasks to recall."""
         if item.job is None or item.job.owner is not item:
             return []  # it was never submitted, or is done
         holders = self._ledger.cancel(item.job)
@@ -233,7 +233,7 @@ class Jobs:
 
 
 class CallQueue:
-    """Calls that share their options, in the order in which they were made."""
+    """Queue of calls that share their options."""
 
     __slots__ = ("called", "item", "stale", "watched")
 
@@ -252,14 +252,15 @@ class CallQueue:
         self.stale = False
         """True while the loop is about to drop cancelled calls."""
         self.watched = False
-        """True while the loop is about to look for more calls, and need not be told.  Only the loop
-        sets it, so an interrupted caller leaves it as it is."""
+        """True while the loop is about to look for more calls, so callers need not wake it.  Only
+        the loop sets it, so an interrupted caller leaves it as it is."""
 
 
 class Calls:
-    """All the queues of one pool.
+    """Queues of calls of one pool.
 
-    ``refusal`` says why no call is taken any more; ``advance`` is called when something follows.
+    ``refusal`` returns the error for calls of a pool that takes none.  ``advance`` is called when
+    the scheduler has to decide again.
     """
 
     def __init__(
@@ -293,33 +294,33 @@ class Calls:
             self._loop.call_soon(self._take, queue)
 
     def drop_cancelled(self, queue: CallQueue) -> None:
-        """Calls were cancelled: let no worker be started for them."""
+        """Drop the cancelled calls, so that no worker starts for them."""
         if not queue.stale:
             queue.stale = True
             try:
                 self._loop.call_soon(self._drop_cancelled, queue)
-            except BaseException:  # interrupted: the next one must not rely on it
+            except BaseException:  # interrupted: the next caller must ask again
                 queue.stale = False
                 raise
 
     def close(self, queue: CallQueue) -> None:
-        """No call of it will come any more."""
+        """Close a queue to further calls."""
         self._loop.call_soon(self._close, queue)
 
-    # The loop's thread
+    # The loop thread
 
     def take_all(self) -> None:
-        """Take what was called until now."""
+        """Take all calls that were made until now."""
         for queue in list(self._queues):
             self._take(queue)
 
     def close_all(self) -> None:
-        """No call will come any more."""
+        """Close all queues to further calls."""
         for queue in list(self._queues):
             self._close(queue)
 
     def cancel_all(self) -> None:
-        """Cancel the calls that no worker was given, where they can be cancelled."""
+        """Cancel the calls that no worker has, in queues whose calls can be cancelled."""
         self.take_all()
         for queue in self._queues:
             if queue.item.cancellable and queue.item.job is not None:
@@ -342,9 +343,9 @@ class Calls:
             self._advance()
 
     def _take(self, queue: CallQueue) -> None:
-        """Calls have come.  Of many short ones in a row, several travel together.
+        """Take the calls of a queue.  If short calls come fast, several travel together.
 
-        Each would else wake a worker, which costs more than the call.
+        Otherwise each would wake a worker, which takes longer than the call.
         """
         called = queue.called
         calls = [called.popleft() for _ in range(len(called))]
@@ -359,7 +360,7 @@ class Calls:
         hurried = now - self._took < FLOOR and job.pace.short
         self._took = now
         busy = job.fed - job.done >= self._workers.size
-        # One for each who is idle: whoever turns out to be stuck then holds up no other.
+        # One call for each idle worker: a slow call then delays no other.
         alone = self._ledger.idle_count()
         for call in calls[:alone]:
             self._ledger.feed(job, [call])

@@ -1,15 +1,15 @@
-"""Waiting for something that happens once, with signals and finalizers about.
+"""Waits for an event that happens once, safe with signal handlers and finalizers.
 
-``threading.Event`` has a lock that all who wait and whoever sets it share.  A signal handler that
-raises while one is between taking and releasing it leaves it in a state that nobody can wait at any
-more, and one that itself waits or sets finds it taken, by its own thread.  Here each who waits has
-a lock of its own, which nobody else waits for.  A finalizer on the loop's thread may set it, and is
-refused if it waits.
+``threading.Event`` has one lock, which waiters and setters share.  Suppose that a signal handler
+runs while its thread holds this lock.  If the handler raises, the lock may stay locked for ever.
+If the handler waits or sets, it deadlocks with its own thread.  Here each waiter has a separate
+lock, for which no other thread waits.  A finalizer on the loop thread may set the event; if it
+waits, it gets an error.
 
-CPython notes a signal and runs its handler between two instructions.  One that strikes after the
-last of them and before the kernel has put the thread to sleep on a lock is noted, and then slept
-over: Ctrl-C seems to do nothing.  A busy machine makes that likely, since a thread that lets go of
-the interpreter is interrupted just there.  So nobody sleeps for longer than ``DOZE``.
+CPython notes a signal, and runs the handler between two instructions.  A signal may arrive after
+the last instruction and before the kernel puts the thread to sleep on a lock.  Then the handler
+runs only after the sleep: Ctrl-C seems to have no effect.  On a busy machine that is likely, since
+threads are often suspended at this point.  So no wait lasts longer than ``DOZE`` at a time.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Waiters:
         self._locks: list[threading.Lock] = []
 
     def join(self) -> threading.Lock:
-        """A lock that ``wake`` will release.  Look after this whether there is still a need."""
+        """Return a lock that ``wake`` will release.  Check the condition again after this."""
         lock = threading.Lock()
         lock.acquire()
         self._locks.append(lock)
@@ -39,22 +39,22 @@ class Waiters:
 
     def leave(self, lock: threading.Lock) -> None:
         """Stop waiting with ``lock``."""
-        with contextlib.suppress(ValueError):  # it is being released this very moment
+        with contextlib.suppress(ValueError):  # ``wake`` releases it at this moment
             self._locks.remove(lock)
 
     def wake(self) -> None:
-        """Let all go on; on any thread."""
+        """Wake all waiters.  Runs on any thread."""
         locks = self._locks
         while locks:
             try:
                 lock = locks.pop()
-            except IndexError:  # another thread wakes them as well
+            except IndexError:  # another thread wakes the waiters, too
                 return
             lock.release()
 
 
 class Latch:
-    """Something that happens once."""
+    """Event that happens once."""
 
     __slots__ = ("_set", "_waiters")
 
@@ -68,11 +68,11 @@ class Latch:
 
     def set(self) -> None:
         """Set the event.  On any thread, also in a finalizer or a signal handler."""
-        self._set = True  # noted first: who joins later sees it
+        self._set = True  # first: a waiter that joins later sees it
         self._waiters.wake()
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Wait for it; False if ``timeout`` seconds are over first."""
+        """Wait for the event; return False if ``timeout`` seconds are over first."""
         if self.is_set():
             return True
         lock = self._waiters.join()
@@ -82,16 +82,16 @@ class Latch:
 
 
 def check_may_wait() -> None:
-    """Raise RuntimeError on a loop's thread: what it waited for would come through that thread."""
+    """Raise RuntimeError on a loop thread, which would wait for itself."""
     if loop.runs_here():
         raise RuntimeError(
-            "a finalizer that the garbage collector runs in Fiber's own thread cannot wait for "
-            "what comes through that thread: use apply_async(), or wait in a thread of its own"
+            "a finalizer cannot wait for a result here: the garbage collector runs it on Fiber's "
+            "own thread, which receives the results. Use apply_async(), or wait in another thread"
         )
 
 
 def acquire(lock: threading.Lock, timeout: float | None) -> bool:
-    """Wait until ``lock`` is released; False if ``timeout`` seconds are over first."""
+    """Wait until ``lock`` is released; return False if ``timeout`` seconds are over first."""
     if timeout is None or timeout > 0:
         check_may_wait()
     longest = threading.TIMEOUT_MAX

@@ -1,4 +1,4 @@
-"""Options of a pool, which are checked once.  An error names the wrong one."""
+"""Options of a pool, and their checks.  An error names the option."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LARGEST_CHUNK = 2**32 - 1
 NO_WISHES = Resources()
 
 IDLE_TIMEOUT = 60.0
-"""Seconds after which a worker that is not needed and has nothing to do leaves."""
+"""Seconds after which an idle worker above the minimum ends."""
 
 
 class PoolOptions(NamedTuple):
@@ -47,14 +47,14 @@ class PoolOptions(NamedTuple):
 
 
 def whole(name: str, value: Any) -> int:
-    """``value`` as an int.  True and False are none."""
+    """Return ``value`` as an int.  True and False are refused."""
     if isinstance(value, bool) or not hasattr(type(value), "__index__"):
         raise TypeError(f"{name} must be a whole number, not {value!r}")
     return operator.index(value)
 
 
 def seconds(name: str, value: Any) -> float | None:
-    """``value`` as a number of seconds; None, as is infinity, for no limit."""
+    """Return ``value`` as a number of seconds; None, and infinity, stand for no limit."""
     if value is None:
         return None
     kind = type(value)
@@ -67,7 +67,7 @@ def seconds(name: str, value: Any) -> float | None:
 
 
 def sizes(processes: int | None, low: int | None, high: int | None) -> tuple[int, int]:
-    """Smallest and largest number of workers."""
+    """Return the smallest and the largest number of workers."""
     if low is None and high is None:
         count = cpu.cpu_count() if processes is None else whole("processes", processes)
         if count < 1:
@@ -88,7 +88,7 @@ def sizes(processes: int | None, low: int | None, high: int | None) -> tuple[int
 
 
 def positive(name: str, value: Any) -> int | None:
-    """``value`` as an int of at least 1; None as it is."""
+    """Return ``value`` as an int of at least 1; None stays None."""
     if value is None:
         return None
     count = whole(name, value)
@@ -98,16 +98,16 @@ def positive(name: str, value: Any) -> int | None:
 
 
 def max_tasks(value: Any) -> int | None:
-    """Tasks that a worker may run."""
+    """Return the number of tasks that a worker may run; None stands for any number."""
     if value is not None and (not isinstance(value, int) or value <= 0):
         raise ValueError(f"maxtasksperchild must be a positive int or None, not {value!r}")
     return value
 
 
 def limits(retries: Any, disruptions: Any) -> Limits:
-    """Times that a task may run again; None: as configured.
+    """Return how often a task may run again; None stands for the configuration's value.
 
-    Without retries a task never runs twice, unless ``disruptions`` says that it may.
+    Without retries a task runs once, unless ``disruptions`` allows more.
     """
     configured = config.current()
     again = configured.retries if retries is None else _times("retries", retries)
@@ -126,7 +126,7 @@ def _times(name: str, value: Any) -> int:
 def exceptions(
     wanted: type[BaseException] | Sequence[type[BaseException]],
 ) -> tuple[type[BaseException], ...]:
-    """Classes of exceptions, from one or several."""
+    """Return exception classes as a tuple, from one class or several."""
     classes: tuple[Any, ...] = (wanted,) if isinstance(wanted, type) else tuple(wanted)
     for cls in classes:
         if not (isinstance(cls, type) and issubclass(cls, BaseException)):
@@ -135,7 +135,7 @@ def exceptions(
 
 
 def chunksize(value: Any) -> int:
-    """Items that travel together."""
+    """Return the number of items that travel together."""
     size = whole("chunksize", value)
     if size < 1:
         raise ValueError(f"Chunksize must be 1+, not {value!r}")
@@ -143,7 +143,7 @@ def chunksize(value: Any) -> int:
 
 
 def buffersize(value: Any) -> int | None:
-    """Items to read ahead."""
+    """Return the number of items to read ahead; None stands for no limit."""
     if value is None:
         return None
     size = whole("buffersize", value)

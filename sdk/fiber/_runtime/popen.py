@@ -1,4 +1,4 @@
-"""``Popen`` protocol of multiprocessing's Process, for all backends."""
+"""The ``Popen`` object behind multiprocessing's Process, for all backends."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from fiber.errors import FiberError, StartError
 
 
 class Popen:
-    """A started process, observed.
+    """A started process, and the observer of its child.
 
-    Attributes and methods as multiprocessing's Process expects them.
+    It has the attributes and methods that multiprocessing's Process expects.
     """
 
     def __init__(self, process: BaseProcess, method: str, on_exit: Callable[[], None]) -> None:
@@ -42,13 +42,13 @@ class Popen:
         self._loop = loop = runtime().loop
         loop.depend(self)
         with naming_the_limit("starting a process"):
-            # Held by whoever writes to it meanwhile, so that it is closed, but never another's.
+            # A writer keeps a reference, so its descriptor is not closed and reused meanwhile.
             self._at_exit: Wakeup | None = Wakeup()
         self.sentinel = self._at_exit.fd
         try:
             self._wait_for_answer(runtime().start(process, self, method=method))
         except BaseException:
-            # Whoever asked does not know of it: it must not go on, if it begins.
+            # The caller gets no Process for it, so it must not run.
             loop.call_soon(self.kill)
             self.close()
             raise
@@ -66,7 +66,7 @@ class Popen:
                 raise fresh(child.start_error)
             raise StartError(f"process {self._name!r}", self.report.reason)
 
-    # What the agent says, on the loop's thread
+    # Reports of the agent, on the loop thread
 
     def begin(self, child: ChildHandle) -> None:
         """Note that the child is being started."""
@@ -83,14 +83,14 @@ class Popen:
         self._answered.set()
 
     def received(self, message: Message) -> None:
-        """Only pool workers talk."""
+        """Drop a message: only pool workers send them."""
         message.release()
 
     def recalled(self, seqs: list[int]) -> None:
-        """Only pool workers are given work."""
+        """Do nothing: only pool workers have tasks."""
 
     def draining(self) -> None:
-        """Do nothing: a process on a host that is about to go gets a signal, if it handles one."""
+        """Do nothing: the agent signals a process that handles SIGTERM before its host ends."""
 
     def exited(self, report: ExitReport) -> None:
         """Note that the process has ended."""
@@ -99,30 +99,30 @@ class Popen:
         at_exit = self._at_exit
         if at_exit is not None:
             at_exit.set()
-        # From here on its Process may be closed.
+        # From here on the user may close the Process.
         self.returncode = report.exitcode
         self._on_exit()
         self._exited.set()
         self._born.set()
         self._answered.set()
-        # Each held the other; the sentinel's descriptor goes when the last user of this lets go.
+        # This breaks a reference cycle.  The sentinel's descriptor closes with its last user.
         self._child = None
 
     def broken(self, error: FiberError) -> None:
         """Count the process as ended, since its end could not be reported."""
         if self.returncode is None:
-            # What the loop failed for, descriptors that were closed, may be in the way of both.
+            # The loop fails if its descriptors were closed, and then these calls may fail, too.
             with contextlib.suppress(OSError):
                 self.kill()
             self.exited(ExitReport(UNKNOWN, str(error)))
 
     @property
     def leaving(self) -> str:
-        """Why the host of the process is about to go; empty if the host stays."""
+        """Reason for which the host is about to end; empty if the host stays."""
         child = self._child
         return "" if child is None else child.leaving
 
-    # What Process asks
+    # Requests of the Process object
 
     @property
     def pid(self) -> int | None:
@@ -132,24 +132,24 @@ class Popen:
         return self._pid
 
     def poll(self) -> int | None:
-        """The exit code, None while it runs."""
+        """Return the exit code, None while the process runs."""
         return self.wait(0)
 
     def wait(self, timeout: float | None = None) -> int | None:
-        """Wait for the exit code."""
+        """Wait for the exit code and return it; None after ``timeout`` seconds."""
         self._exited.wait(timeout)
         return self.returncode
 
     def terminate(self) -> None:
-        """SIGTERM."""
+        """Send SIGTERM."""
         self._signal(signal.SIGTERM)
 
     def kill(self) -> None:
-        """SIGKILL."""
+        """Send SIGKILL."""
         self._signal(signal.SIGKILL)
 
     def kill_with_stack(self) -> None:
-        """Have it write the Python stacks of its threads, and kill it."""
+        """Have the process write the Python stacks of its threads, and kill it."""
         self._signal(TELL)
 
     def _signal(self, signum: int) -> None:
@@ -158,5 +158,5 @@ class Popen:
             child.signal(signum)
 
     def close(self) -> None:
-        """Give the sentinel's descriptor back."""
+        """Close the sentinel's descriptor, once its last user lets go."""
         self._at_exit = None

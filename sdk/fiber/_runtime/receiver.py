@@ -1,6 +1,7 @@
 """From a packet of a worker to the outcomes of tasks.
 
-On the loop's thread, but for ``_unpickle_fault``, which may run the user's code.
+Runs on the loop thread.  ``_unpickle_fault`` is the exception: it may run the user's code, and so
+runs on the background thread.
 """
 
 from __future__ import annotations
@@ -25,8 +26,11 @@ _NOT_READY = "it answered for batch {} before it was ready"
 
 
 class AnswerReceiver:
-    """Takes what workers say.  ``advance`` is called when something follows, ``on_ready`` with a
-    worker that is ready for work."""
+    """Takes the packets of workers.
+
+    ``advance`` is called when the scheduler has to decide again, ``on_ready`` with each worker that
+    is ready for tasks.
+    """
 
     def __init__(
         self,
@@ -51,9 +55,9 @@ class AnswerReceiver:
         self._on_ready = on_ready
 
     def take(self, handle: WorkerHandle, message: Message) -> None:
-        """A packet from a worker."""
+        """Take a packet from a worker."""
         try:
-            if not handle.fault:  # else it was killed
+            if not handle.fault:  # else it was killed for an earlier one
                 self._take(handle, read(message))
         except WrongAnswer as error:
             self._convict(handle, str(error))
@@ -80,13 +84,13 @@ class AnswerReceiver:
                 self._unreadable(kind, batch, Pickled(work.ERROR, error, ()))
 
     def _held(self, handle: WorkerHandle, seq: int) -> Batch | None:
-        """Return the batch that a worker speaks of, or None if that is over."""
+        """Return the batch that a worker answers for, or None if the batch is over."""
         if handle.worker is None:
             raise WrongAnswer(_NOT_READY.format(seq))
         return self._ledger.held(handle.worker, seq)
 
     def _convict(self, handle: WorkerHandle, reason: str) -> None:
-        """Kill a worker that sent what it cannot send; its tasks run elsewhere once it is gone."""
+        """Kill a worker that sent a wrong answer; its tasks run elsewhere once it is gone."""
         if handle.worker is not None:
             self._ledger.retire(handle.worker)
         handle.convict(reason)
@@ -117,13 +121,16 @@ class AnswerReceiver:
         if receipt is not None:
             item: WorkItem = receipt.job.owner
             if item.future is None and receipt.size and receipt.item(receipt.start).blocking:
-                # First: who waited for it may call again at once.
+                # Before the outcome is set: the caller that waits for it may call again at once.
                 self._leases.offer(receipt.batch.worker.key)
             self._jobs.put(receipt, values, mixed=mixed, size=size)
         self._advance()
 
     def _unreadable(self, kind: str, batch: Batch, error: Pickled) -> None:
-        """A worker cannot unpickle a batch, or its function: then no task of its job can run."""
+        """Handle a batch that its worker cannot unpickle.
+
+        If the function does not unpickle, no task of the job can run.
+        """
         self._sender.settled(batch.seq)
         if kind == work.UNREADABLE:
             self._sender.split(batch.seq, error)
@@ -139,12 +146,12 @@ class AnswerReceiver:
         """Unpickle the error of a function on the background thread, as it runs the user's code."""
         try:
             fault = error.decode().error
-        except BaseException as raised:  # what its unpickling raises may be anything
+        except BaseException as raised:  # the user's unpickler may raise anything
             fault = raised
         self._loop.call_soon(self._unusable, batch, fault)
 
     def _unusable(self, batch: Batch, error: BaseException) -> None:
-        """A worker cannot unpickle the function of a batch, and has dropped it."""
+        """Fail the job of a batch whose function its worker cannot unpickle."""
         if self._ledger.batches.get(batch.seq) is not batch:
             return  # its worker is gone
         if batch.job is not None:
@@ -153,10 +160,10 @@ class AnswerReceiver:
         self._advance()
 
     def recalled(self, handle: WorkerHandle, seqs: list[int]) -> None:
-        """A worker will never see these batches."""
+        """Have the tasks of batches wait again that the worker will never read."""
         if handle.worker is None:
             return
-        if 0 in seqs:  # no batch, but what told it to end: the recall was later by an agent's turn
+        if 0 in seqs:  # the recall has taken back the request to end: it is sent again
             handle.dismiss()
         self._leases.keep_unread(handle, seqs)
         self._sender.unread(handle.worker, seqs)

@@ -13,7 +13,7 @@ from multiprocessing.process import current_process
 from fiber._agent.child import UnguardedMainError
 
 START_METHODS = ("forkserver", "spawn", "fork")
-"""``forkserver`` and ``fork`` both fork from Fiber's zygote; the default comes first."""
+"""Start methods, the default first.  ``forkserver`` and ``fork`` both fork from the zygote."""
 
 chosen: str | None = None
 """Start method that ``set_start_method`` set, or that the first use settled."""
@@ -30,13 +30,13 @@ preload: list[str] = []
 
 
 def settle() -> str:
-    """The start method in force; from now on it counts as set."""
+    """Return the start method in force.  From now on it counts as set."""
     choose(chosen or START_METHODS[0])
     return chosen or START_METHODS[0]
 
 
 def choose(method: str | None) -> None:
-    """Set it, or forget what was set."""
+    """Set the start method; None makes it unset again."""
     global chosen
     chosen = method
 
@@ -48,7 +48,7 @@ def inherit(method: str | None, modules: list[str]) -> None:
 
 
 def zygote_method(method: str | None) -> str:
-    """Return the action of the zygote for a start method; None is the one in force."""
+    """Return what the zygote does for a start method; None stands for the one in force."""
     return "spawn" if (method or settle()) == "spawn" else "fork"
 
 

@@ -1,7 +1,7 @@
-"""The one process-wide state: the loop, the backend, the hub.
+"""Process-wide state of Fiber: the loop, the backend, the hub.
 
-Made by the first process, pool or shared handle; ended at interpreter exit.  A process forked by
-someone else (``os.fork``, multiprocessing) starts without one and makes its own when it needs it.
+The first process, pool or shared handle makes it, and it ends at interpreter exit.  A process that
+was forked without Fiber (``os.fork``, multiprocessing) has none, and makes one when it needs it.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from fiber._backends.shipping import Program, Shipping
 
 _WORTH_SHARING = 1 << 16
-"""Bytes of a pickle below which it is as well sent to each process."""
+"""Bytes of a pickle from which on it is sent once for all processes."""
 
 _EXIT_PRIORITY = -100  # after multiprocessing has ended daemons and joined the other children
 
@@ -64,13 +64,13 @@ class Runtime:
             raise
 
     def _make_hub(self) -> Hub | None:
-        # One hub a host: a process that Fiber started uses the one that its agent has.
+        # One hub for each host: a process that Fiber started uses its agent's.
         if hub_client.inherited_address() is not None:
             return None
         return Hub(self.loop, self.host, self.config.runtime_directory)
 
     def _close_hub(self) -> None:
-        if _runtime is None:  # otherwise the hub of this process is that of another runtime
+        if _runtime is None:  # otherwise another runtime has the hub of this process
             hub_client.set_local_hub(None)
         if self.hub is not None:
             self.hub.close()
@@ -89,13 +89,13 @@ class Runtime:
         method: str = "fork",
         shared: SharedArguments | None = None,
     ) -> ChildHandle:
-        """Start ``process`` as a child; ``tasks`` makes it a pool worker.
+        """Start ``process`` as a child, and return at once; ``tasks`` makes it a pool worker.
 
-        ``shared``: the arguments of ``process``, as several have them.
+        ``shared``: the arguments of ``process``, if several processes have them.
 
-        Returns at once; the owner hears what becomes of it, ``begin`` first.  An error in pickling
-        is raised here.  Whoever is interrupted here will be called ``begin``, or nothing has
-        happened; what is asked of the loop from then on comes after it.
+        The loop calls the owner's ``begin`` first, and then reports what happens to the child.  An
+        error in pickling is raised here.  If the caller is interrupted, either no child starts, or
+        ``begin`` is called, before any request that the caller makes later.
         """
         same_host = self.backend.same_host
         preparation, program = self._preparation(process, anew=not tasks)
@@ -122,11 +122,11 @@ class Runtime:
         return made
 
     def _preparation(self, process: Any, *, anew: bool) -> tuple[bytes, Program | None]:
-        """Return the set-up of a child, and its files; ``anew`` as in ``Shipping``."""
+        """Return the preparation data of a child, and its files; ``anew`` as in ``Shipping``."""
         data = self._spawn_data(f"process {process.name!r}")
         same_host = self.backend.same_host
         data["authkey"] = bytes(data["authkey"])
-        # What such a process starts itself runs on its own host.
+        # A child's children run on its host.
         data["calls"] = [
             (_config_sources.keep, (pickle.dumps(replace(self.config, backend="local")),)),
             (start_methods.inherit, (start_methods.chosen, start_methods.preload)),
@@ -147,12 +147,12 @@ class Runtime:
 
     def _spawn_data(self, who: str) -> dict[str, Any]:
         """Return the preparation data that multiprocessing gives every child."""
-        # pdb leaves its program a main module without one, which multiprocessing does not expect.
+        # Under pdb the main module has no __spec__, which multiprocessing expects.
         vars(sys.modules["__main__"]).setdefault("__spec__", None)
         try:
             data = spawn.get_preparation_data("")
         except FileNotFoundError as error:
-            reason = "its working directory is this program's, which was deleted; os.chdir() first"
+            reason = "this program's working directory was deleted. Change it by os.chdir() first"
             raise StartError(who, reason) from error
         del data["start_method"], data["name"]
         if reduction.main_is_out_of_reach():
@@ -161,12 +161,12 @@ class Runtime:
         return data
 
     def look_at_program(self) -> None:
-        """Have the children that are started from now on see the program's files as they are."""
+        """Send the program's files as they are now to the children that start from now on."""
         if self._shipping is not None:
             self._shipping.program(self._spawn_data("a pool"), anew=True)
 
     def close(self) -> None:
-        """End every child, agent and thread.  Not on the loop's thread."""
+        """End every child, agent and thread.  Runs on any thread but the loop's."""
         _logs.debug("ending all processes and agents")
         self.backend.close()
         self.loop.stop()
@@ -174,9 +174,9 @@ class Runtime:
 
 
 class SharedArguments:
-    """``args`` of Processes, to be pickled when the first is started.
+    """Arguments that several processes share, pickled when the first one starts.
 
-    If several threads start one first, each may pickle them: equal bytes are the same blob.
+    If several threads start processes at once, each may pickle them: equal bytes are one blob.
     """
 
     def __init__(self, args: tuple[Any, ...]) -> None:
@@ -195,14 +195,14 @@ class SharedArguments:
 
 
 class ChildOwner(ChildObserver, Protocol):
-    """Owner of a child, which can reach the child from its first moment on."""
+    """Observer of a child that also starts it."""
 
     def begin(self, child: ChildHandle) -> None:
-        """Note how to reach it, and start it.  On the loop's thread, before all else."""
+        """Keep the child's handle, and start it.  The loop calls this first of all."""
 
 
 class _Releasing:
-    """Passes on what is heard of a child and, when it is gone, takes back what it never used."""
+    """Observer that passes on all reports, and releases unused grants once the child has ended."""
 
     def __init__(self, observer: ChildObserver, grants: GrantSet) -> None:
         self.started = observer.started
@@ -256,7 +256,7 @@ def _modules_of(process: Any) -> list[str]:
     """Return the modules that the zygote may import for all children."""
     target = getattr(process, "_target", None)
     names = {type(process).__module__, str(getattr(target, "__module__", ""))}
-    names = {name for name in names if not name.startswith("fiber._runtime.")}  # they stay here
+    names = {name for name in names if not name.startswith("fiber._runtime.")}  # not for children
     return sorted(names & sys.modules.keys() - {"__main__"}) + [
         name for name in _OURS if name in sys.modules
     ]
@@ -265,15 +265,15 @@ def _modules_of(process: Any) -> list[str]:
 _OURS = ("fiber.connection", "fiber.queues", "fiber.synchronize", "fiber._agent.worker")
 
 
-_lock = threading.RLock()  # a finalizer may come back here while one is made
+_lock = threading.RLock()  # a finalizer may ask for the runtime while it is made
 _runtime: Runtime | None = None
 _may_link = True
-"""True if this process may have agents.  nng, which carries links, aborts a forked copy of a
-process that has used it.  Such a copy runs its processes on its own host."""
+"""True if this process may have agents on other hosts.  Their links need nng, which aborts in a
+forked copy of a process that has used it.  Such a copy runs its processes on its host."""
 
 
 def runtime() -> Runtime:
-    """The runtime of this process; made at the first call."""
+    """Return the runtime of this process; the first call makes it."""
     if _runtime is None:
         with _lock:
             if _runtime is None:
@@ -288,17 +288,17 @@ def _make() -> None:
     made = None
     try:
         made = Runtime()
-        if _runtime is None:  # else a finalizer was faster
+        if _runtime is None:  # else a finalizer has made one
             hub_client.set_local_hub(made.hub)
             util.Finalize(None, shutdown, exitpriority=_EXIT_PRIORITY)
             _runtime = made
     finally:
-        if made is not None and made is not _runtime:  # or it was interrupted
+        if made is not None and made is not _runtime:  # or the making was interrupted
             made.close()
 
 
 def shutdown() -> None:
-    """End the runtime and all that it started; the next use makes a new one."""
+    """End the runtime and all processes that it started; the next use makes a new one."""
     global _runtime
     with _lock:
         ending, _runtime = _runtime, None

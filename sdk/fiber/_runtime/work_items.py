@@ -23,14 +23,14 @@ from fiber._transport.loop import DOZE
 from fiber._wire import packet, work
 
 FUNCTIONS = 128
-"""Functions that are recognized when they come again."""
+"""Number of functions that are recognized when they come again."""
 
 FUNCTION_SIZE = 1 << 16
-"""Bytes of a pickled function up to which it is."""
+"""Largest pickle, in bytes, of a function that is recognized."""
 
 
 class Function:
-    """A function that workers are asked to apply, pickled once."""
+    """Function that a pool applies, pickled once."""
 
     __slots__ = ("buffers", "data", "grants", "id", "name", "pace")
 
@@ -57,14 +57,14 @@ def name_of(function: Any) -> str:
 
 
 class FunctionCache:
-    """Recognizes functions.  Any thread."""
+    """Recognizes functions by their pickles.  Runs on any thread."""
 
     def __init__(self) -> None:
         self._known: dict[bytes, Function] = {}
         self._ids = itertools.count(1)
 
     def get(self, function: Callable[..., Any]) -> Function:
-        """``function``, pickled; one that pickles as an earlier one did is the same."""
+        """Return ``function``, pickled.  Equal pickles are the same Function."""
         try:
             data, buffers, grants = reduction.encode_reusable(function)
         except reduction.REFUSALS as error:
@@ -77,20 +77,25 @@ class FunctionCache:
         made = Function(next(self._ids), name_of(function), *sent, grants)
         if not buffers and grants is None and len(data) <= FUNCTION_SIZE:
             if len(self._known) >= FUNCTIONS:
-                self._known.clear()  # in one step: several threads may be here
+                self._known.clear()  # in one step, as several threads may call this
             self._known[data] = made
         return made
 
 
 AHEAD = 3
-"""Messages worth of tasks that are read ahead for each worker."""
+"""Number of messages for which tasks are read ahead, for each worker."""
 
 
 class InputStream:
-    """The input of one job.  ``limit``: tasks that may be read and not yet consumed by the user.
+    """Input of one job, read from an iterator no faster than workers run it.
 
-    ``consumed`` says how many were.  ``notify`` is called, on the reading thread or the user's,
-    when there is something that the executor waits for: input, or room below the limit.
+    It is a bounded queue between the reading thread (the caller's, or a feeder's) and the executor.
+    The executor grants the reader credit: the number of items that it may read.  When the credit
+    is used up, the reader waits at a queue of grants.
+
+    ``limit`` bounds the tasks that are read and not consumed; ``consumed`` returns how many were
+    consumed.  ``notify`` is called, on the reading thread or the user's, when the executor can go
+    on: there is input, or room below the limit.
     """
 
     def __init__(
@@ -111,13 +116,13 @@ class InputStream:
         self._granted = 0
         self._taken = 0
         self._awaited = True
-        self._refused = 0  # how often the executor has looked for room
-        self._asked = 0  # of these, the last time that it found some or was asked to look again
+        self._refused = 0  # number of times that the executor looked for room
+        self._asked = 0  # value of ``_refused`` when it found room, or was last notified
 
     # The reading thread
 
     def read(self, iterable: Iterable[Any]) -> None:
-        """Read it all; raises what the iterable raises."""
+        """Read all of ``iterable`` on this thread; raise the errors of the iterable."""
         check_may_wait()
         iterator = iter(iterable)
         items, unit = self._items, self._unit
@@ -142,12 +147,12 @@ class InputStream:
     def _next_credit(self) -> int:
         while True:
             with contextlib.suppress(queue.Empty):
-                return self._credit.get(timeout=DOZE)  # a signal may be slept over
+                return self._credit.get(timeout=DOZE)  # not longer: see ``latch``
 
     def read_on_thread(
         self, iterable: Iterable[Any], finish: Callable[[BaseException | None], None]
     ) -> None:
-        """Read it all on a thread of its own, and ``finish`` with what was raised, if anything."""
+        """Read all of ``iterable`` on a new thread, and ``finish`` with its error, if it raised."""
 
         def run() -> None:
             error = None
@@ -159,15 +164,15 @@ class InputStream:
 
         try:
             threading.Thread(target=run, name="fiber-pool-feeder", daemon=True).start()
-        except RuntimeError as error:  # the system has no room for it
+        except RuntimeError as error:  # the system has no room for the thread
             finish(error)
 
     # The user's thread
 
     def ask(self) -> None:
-        """The user took results: notify, if there was no room before.
+        """Notify if there was no room before: the user took results.
 
-        Only notes that it has, when it has: whoever is interrupted asks again the next time.
+        The mark is set after the notification, so an interrupted user notifies again next time.
         """
         refused = self._refused
         if self._asked < refused:
@@ -184,18 +189,18 @@ class InputStream:
         return taken
 
     def await_input(self) -> None:
-        """Notify when there is something.  Take once more after this: it may have come before."""
+        """Notify when there is input.  Take once more after this: input may have come before."""
         self._awaited = True
 
     def grant(self, waiting: int, workers: int, pace: TaskPace, target: float) -> None:
-        """Let the reader go on if little is left: ``waiting`` tasks that nobody has yet."""
+        """Let the reader go on if few tasks are left; ``waiting`` of them have no worker yet."""
         bound = AHEAD * max(workers, 1) * max(pace.message_size(target), self._unit)
         ahead = waiting + self._granted - self._taken
         if self.ended or 2 * ahead > bound:
             return
         units = -(-(bound - ahead) // self._unit)
         if self._limit is not None:
-            self._refused += 1  # first: who consumes after the count asks
+            self._refused += 1  # before the count: a user that consumes after it notifies
             units = min(units, self._room(self._limit) // self._unit)
         if units:
             self._asked = self._refused
@@ -206,31 +211,30 @@ class InputStream:
         return limit - (self._granted - self._consumed())
 
     def lift_limit(self) -> None:
-        """Read without a limit: a caller that waits for all results consumes none."""
+        """Read without a limit, for a caller that waits for all results and consumes none."""
         self._limit = None
 
     def end(self) -> None:
-        """Read no more."""
+        """Stop reading."""
         self.ended = True
         self._credit.put(0)
 
 
 class Future(Protocol):
-    """Receiver of the outcomes of a work item, or of one call.  Called on the loop's thread."""
+    """Receiver of the outcomes of a work item, or of one call.  Runs on the loop thread."""
 
     def add_results(self, start: int, outcomes: list[Any], mixed: bool, size: int = 0) -> bool:
-        """Outcomes of the tasks from ``start`` on.  Each task's comes once, in any order.
+        """Take the outcomes of the tasks from ``start`` on.  Batches come in any order, each once.
 
-        Unless ``mixed`` they are all plain values.  They came in ``size`` bytes.  True asks for no
-        more than must be, since nobody reads them: until it says otherwise, by what it was given
-        for that.
+        Unless ``mixed``, all outcomes are plain values.  They came in ``size`` bytes.  Return True
+        to pause the job because no user reads the results; ``Executor.resume`` ends the pause.
         """
 
     def has_room(self) -> bool:
-        """Tell whether it takes more outcomes, after it has asked for no more."""
+        """Tell whether to end the pause that ``add_results`` asked for."""
 
     def lift_bound(self) -> None:
-        """Take all that comes: whoever would read them waits for the rest."""
+        """Ask for no pause from now on: the user waits for all results."""
 
     def set_done(self) -> None:
         """Note that all tasks have their outcomes."""
@@ -243,10 +247,10 @@ class Cancellable(Future, Protocol):
     """The future of a call that may be cancelled until it is given to a worker."""
 
     def claim(self) -> bool:
-        """Claim the call for a worker; False if it was cancelled.  May be called again."""
+        """Claim the call for a worker; return False if it was cancelled.  May be repeated."""
 
     def cancel(self) -> bool:
-        """Cancel the call; False if it was claimed."""
+        """Cancel the call; return False if it was claimed."""
 
     def cancelled(self) -> bool:
         """Tell whether the call was cancelled."""
@@ -275,7 +279,7 @@ class Call:
         """True if a thread waits for the outcome at once."""
 
     def copy_buffers(self) -> None:
-        """Keep what was passed as it is now: the caller goes on before it is sent."""
+        """Copy the buffers: the caller may change the objects before the call is sent."""
         if self.buffers:
             self.buffers = packet.kept(self.buffers)
 
@@ -285,11 +289,11 @@ class Call:
 
 
 class WorkItem:
-    """A job of the ledger, and all that the ledger need not know of it.
+    """A call, a map or a stream of calls: what to run, and the future for the outcomes.
 
-    Without a ``future`` each of its tasks is a Call with its own.  A job and its work item know
-    each other, its future and its stream; ``Jobs`` parts them once it is over, so that results are
-    freed when the user lets go of them, not when the collector comes.
+    Without a ``future`` each of its tasks is a Call, which has one.  A work item refers to its job
+    in the ledger, its future and its stream, and they to it.  ``Jobs`` cuts these references when
+    the job is over.  So results are freed as soon as the user drops them.
     """
 
     __slots__ = (
@@ -325,14 +329,14 @@ class WorkItem:
         self.exact = exact
         self.timeout = timeout
         self.limits = limits
-        """None: as its pool says."""
+        """Limits of lost runs; None stands for the pool's."""
         self.cancellable = cancellable
         """True if the futures of its calls can be cancelled."""
         self.job: Job | None = None
-        """Once the executor has taken it."""
+        """Job in the ledger, once the executor has taken the item."""
         self.stream: InputStream | None = None
         self.grants: list[GrantSet] = []
-        """Grants with which workers unpickle the pipes and queues among the items."""
+        """Grants by which workers attach to the pipes and queues among the items."""
 
     def task_name(self, task: int, item: Any) -> str:
         """Return the name of a task, for messages."""
@@ -351,7 +355,7 @@ def pickle_call(
     *,
     blocking: bool = False,
 ) -> Call | None:
-    """A call, pickled; None if it does not pickle, and ``reject`` has told its future."""
+    """Pickle a call; if that fails, pass the error to ``reject`` and return None."""
     try:
         data, buffers, grants = reduction.encode_reusable((function, args, kwargs))
         if len(buffers) > work.BUFFERS:

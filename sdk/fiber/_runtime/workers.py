@@ -29,9 +29,9 @@ from fiber.resources import Resources, merged, resources_of, with_resources
 
 
 class WorkerResources:
-    """Decided by the first task: its function's wishes, added to the pool's own.
+    """Resources of all workers of a pool: the pool's, and those of the first task's function.
 
-    No lock: of several threads whose tasks are the first, one decides.
+    If several threads submit the first task, one of them decides.  This needs no lock.
     """
 
     def __init__(self, own: Resources) -> None:
@@ -44,7 +44,7 @@ class WorkerResources:
         return self._chosen.setdefault("resources", self._own)
 
     def choose_for(self, function: Callable[..., Any]) -> None:
-        """Let the workers suit ``function``; ValueError if they are of another kind already."""
+        """Choose the resources that ``function`` needs; ValueError if others were chosen before."""
         wishes = resources_of(function)
         wanted = merged(self._own, wishes)
         chosen = self._chosen.setdefault("resources", wanted)
@@ -56,30 +56,30 @@ class WorkerResources:
 
 
 class Supervisor(Protocol):
-    """Observer of workers.  Its methods run on the loop's thread."""
+    """Observer of workers.  Its methods run on the loop thread."""
 
     def on_message(self, handle: WorkerHandle, message: Message) -> None:
         """Take a packet from a worker."""
 
     def on_recalled(self, handle: WorkerHandle, seqs: list[int]) -> None:
-        """The worker will never see these."""
+        """Have the tasks of batches wait again that the worker will never read."""
 
     def on_draining(self, handle: WorkerHandle) -> None:
-        """The worker's host is about to go."""
+        """Replace the worker: its host is about to end."""
 
     def on_exit(self, handle: WorkerHandle, report: ExitReport) -> None:
-        """The worker is gone."""
+        """Remove the worker, which has ended."""
 
 
 class WorkerHandle:
-    """Process of a worker on the side of its pool; also the ``Popen`` behind its Process object.
+    """A worker, as its pool sees it; also the ``Popen`` behind its Process object.
 
     The scheduler knows it as a ``PoolMember``.  The pool's worker set changes ``worker`` and
     ``leaving``; all else changes here alone.
     """
 
     sentinel = -1
-    """Placeholder that a Process reads when it starts.  A real sentinel is made if it is wanted."""
+    """Placeholder that a Process reads when it starts.  The first use makes a real sentinel."""
 
     def __init__(self, supervisor: Supervisor, runtime: Runtime, shared: SharedArguments) -> None:
         self.process: BaseProcess | None = None
@@ -90,11 +90,11 @@ class WorkerHandle:
         self.complaint = ""
         """Error of its initializer, or of its start."""
         self.fault = ""
-        """Wrong answer for which the pool has killed it."""
+        """Wrong answer for which the pool has killed the worker."""
         self.leaving = False
-        """True if it was told to leave, or will be at once."""
+        """True once the worker was asked to end, or is about to be."""
         self.tasks = 0
-        """Number of tasks that it has done."""
+        """Number of tasks that the worker has done."""
         self.returncode: int | None = None
         self._supervisor = supervisor
         self._runtime = runtime
@@ -108,12 +108,12 @@ class WorkerHandle:
 
     @property
     def name(self) -> str:
-        """The worker's name."""
+        """Name of the worker."""
         return self.child.name if self.child is not None else "?"
 
     @property
     def host(self) -> str:
-        """The name of its host, once that is known."""
+        """Name of the worker's host; ``?`` while it is unknown."""
         return self.child.host if self.child is not None else "?"
 
     def start(self, process: BaseProcess) -> None:
@@ -140,13 +140,13 @@ class WorkerHandle:
         self.fault = reason
         self.kill()
 
-    # What the agent says, on the loop's thread
+    # Reports of the agent, on the loop thread
 
     def begin(self, child: ChildHandle) -> None:
         """Note that the child is being started."""
         self.child = child
         child.start()
-        if self.leaving:  # it was told to before it could be reached
+        if self.leaving:  # it was asked to before it had a child
             self.dismiss()
             if self._terminated:
                 self.kill()
@@ -180,12 +180,12 @@ class WorkerHandle:
         at_exit = self._at_exit
         if at_exit is not None:
             at_exit.set()
-        # Its caller adds it, and looks at ``returncode`` afterwards.
+        # ``Process.start`` adds the process, and looks at ``returncode`` afterwards.
         mp_process._children.discard(self._launched)  # type: ignore[attr-defined]
         self._supervisor.on_exit(self, report)
 
     def start_failure(self, report: ExitReport) -> StartFailure:
-        """Return what its end tells about the start of workers, if it was not ready."""
+        """Return the start failure that the worker's end is, if the worker was not ready."""
         text = self.complaint or "\n".join(report.log)
         reason = "it raised an error" if self.complaint else report.reason
         killed = report.cause == Cause.REFUSED or (not self.complaint and report.exitcode < 0)
@@ -198,17 +198,17 @@ class WorkerHandle:
             final=final if isinstance(final, FiberError) else None,
         )
 
-    # What its Process object asks
+    # Requests of its Process object
 
     @property
     def pid(self) -> int | None:
-        """Pid of the process.  Waits until there is one."""
+        """Pid of the process.  Waits up to ``start_timeout`` seconds until there is one."""
         if self._pid is None and not self._runtime.loop.on_thread():
             self._born.wait(self._runtime.config.start_timeout)
         return self._pid
 
     def exit_descriptor(self) -> int:
-        """A descriptor that becomes readable when it is gone; made when first asked for."""
+        """Return a descriptor that becomes readable at the worker's end; the first use makes it."""
         if self._at_exit is None:
             self._at_exit = Wakeup()
             if self.returncode is not None:
@@ -216,54 +216,54 @@ class WorkerHandle:
         return self._at_exit.fd
 
     def poll(self) -> int | None:
-        """The exit code, None while it runs."""
+        """Return the exit code, None while the process runs."""
         return self.returncode
 
     def wait(self, timeout: float | None = None) -> int | None:
-        """Wait for the exit code."""
+        """Wait for the exit code and return it; None after ``timeout`` seconds."""
         self._exited.wait(timeout)
         return self.returncode
 
     def signal(self, signum: int) -> None:
-        """Send it a signal."""
+        """Send the process a signal."""
         if self.returncode is None and self.child is not None:
-            # A program that has closed our descriptors has to hear of that, not of this.
+            # If the program has closed Fiber's descriptors, another error reports that.
             with contextlib.suppress(OSError):
                 self.child.signal(signum)
 
     def dismiss(self) -> None:
-        """Tell it to end once it has read this."""
+        """Ask the worker to end once it has read its batches."""
         if self.child is not None:
             self.child.deliver(0, work.STOP_MESSAGE)
 
     def terminate(self) -> None:
-        """SIGTERM."""
+        """Send SIGTERM."""
         self._terminated = True
         self.signal(signal.SIGTERM)
 
     def kill(self) -> None:
-        """SIGKILL."""
+        """Send SIGKILL."""
         self.signal(signal.SIGKILL)
 
     def kill_with_stack(self) -> None:
-        """Have it write the Python stacks of its threads, and kill it."""
+        """Have the worker write the Python stacks of its threads, and kill it."""
         self.signal(TELL)
 
     def close(self) -> None:
-        """Give the descriptor back."""
+        """Close the sentinel's descriptor, once its last user lets go."""
         self._at_exit = None
 
 
 KILL_AFTER = 2.0
-"""Seconds between SIGTERM and SIGKILL for workers that are to end at once."""
+"""Seconds between SIGTERM and SIGKILL for workers that must end at once."""
 
 
 class Launcher:
     """Starts workers of one pool, and ends them by force.
 
-    Not on the loop's thread: the user's initializer and its arguments are pickled, and agents may
-    need the loop.  ``on_failed`` is called, on the loop's thread, with workers whose processes
-    there will never be, and why, if that was tried.
+    Workers start on other threads than the loop's, since pickling the initializer and its arguments
+    may run the user's code, and agents may need the loop.  ``on_failed`` is called, on the loop
+    thread, with workers that get no process, and with the error if a start was tried.
     """
 
     def __init__(
@@ -292,17 +292,20 @@ class Launcher:
         return [WorkerHandle(supervisor, self._runtime, self._arguments) for _ in range(count)]
 
     def launch_now(self, handles: Sequence[WorkerHandle], timeout: float) -> None:
-        """Start some on the calling thread; raises what stands in the way of one."""
+        """Start workers on the calling thread; raise the error if one cannot be started."""
         for handle in handles:
             self._start(handle)
         self._raise_start_error(handles, timeout)
 
     def give_up(self, handles: Sequence[WorkerHandle]) -> None:
-        """Starting them was interrupted; on the loop's thread, which knows whose child begins."""
+        """Give up workers whose start was interrupted.
+
+        Runs on the loop thread, where it is known which of them have a child.
+        """
         self._on_failed([handle for handle in handles if handle.child is None], None)
 
     def _raise_start_error(self, handles: Sequence[WorkerHandle], timeout: float) -> None:
-        """Wait until their agent has looked at them: the system may have no room for them."""
+        """Wait until the agent has tried to start the workers; raise its error, if there is one."""
         looked_at = Latch()
         self._loop.call_soon(looked_at.set)
         if not self._loop.on_thread():
@@ -320,7 +323,7 @@ class Launcher:
         handle.start(process)
 
     def launch_soon(self, handles: Sequence[WorkerHandle]) -> None:
-        """Start some on the background thread; called on the loop's."""
+        """Start workers on the background thread.  The loop thread calls this."""
         for handle in handles:
             try:
                 self._background.submit(self._launch, handle)
@@ -328,7 +331,7 @@ class Launcher:
                 self._loop.call_soon(self._on_failed, (handle,), error)
 
     def end(self, handles: Iterable[Any]) -> None:
-        """End these at once, and by force if that is of no use.  On the loop's thread."""
+        """End workers at once, and kill them if they do not end.  Runs on the loop thread."""
         for handle in handles:
             handle.terminate()
             self._ending.append(handle)
@@ -351,7 +354,7 @@ class Launcher:
             try:
                 self._start(handle)
                 return
-            except BaseException as raised:  # want of descriptors; or the user's pickler's own
+            except BaseException as raised:  # no descriptors, or any error of the user's pickler
                 error = raised
         self._loop.call_soon(self._on_failed, (handle,), error)
 
@@ -374,30 +377,31 @@ class WorkerInfo(NamedTuple):
 
 
 class WorkerView:
-    """Looks at the workers from any thread, and waits for them."""
+    """View of a pool's workers, for users on any thread."""
 
     def __init__(self, workers: PoolWorkerSet, loop: Loop) -> None:
         self._workers = workers
         self._loop = loop
         self._waiting: list[Latch] = []
-        """Any thread adds and removes its own."""
+        """Latches of the waiting threads.  Each thread adds and removes one."""
         self._over = False
 
     def processes(self) -> list[BaseProcess]:
-        """The processes of those that are there."""
+        """Return the Process objects of the workers that have one."""
         handles: list[Any] = list(self._workers.members)
         return [handle.process for handle in handles if handle.process is not None]
 
     def describe(self) -> list[WorkerInfo]:
-        """All that are there, the oldest first."""
+        """Return the states of all workers, the oldest first."""
         return [_describe(handle) for handle in list(self._workers.members)]
 
     def wait_until_up(self, timeout: float | None) -> bool:
-        """Wait until the pool's least number of workers are ready, or it is clear that they will
-        not be; False if ``timeout`` seconds are over first.
+        """Wait until the pool's minimum of workers are ready, or cannot start.
+
+        Return False if ``timeout`` seconds are over first.
         """
         latch = Latch()
-        # Both sides note first and look then: one of both sees the other.
+        # The waiter adds its latch before the loop looks, so the loop sees the latch.
         self._waiting.append(latch)
         try:
             self._loop.call_soon(self.changed)
@@ -405,10 +409,10 @@ class WorkerView:
         finally:
             self._waiting.remove(latch)
 
-    # On the loop's thread
+    # On the loop thread
 
     def changed(self) -> None:
-        """Workers are ready, or it is clear that none will be."""
+        """Wake the waiters if the pool's minimum of workers are ready, or cannot start."""
         workers = self._workers
         if (
             self._over
@@ -419,7 +423,7 @@ class WorkerView:
                 latch.set()
 
     def end(self) -> None:
-        """Note that there will be no more workers."""
+        """Note that the pool has no more workers."""
         self._over = True
         self.changed()
 
