@@ -3,7 +3,7 @@
 ::
 
     submit, feed, cancel ─┐                       ┌─► assign    batches to send
-    ready, receive ───────┼─► Ledger, WorkerSet ──┼─► recall    workers to ask for unread batches
+    ready, receive ───────┼─► Ledger, worker set ─┼─► recall    workers to ask for unread batches
     gone, expire ─────────┘       decide(now)     ├─► start     workers to start
     close, terminate                              ├─► dismiss   workers to ask to end
                                                   ├─► end       workers to end at once
