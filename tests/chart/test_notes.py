@@ -49,7 +49,7 @@ def test_it_says_what_is_watched(helm: Helm) -> None:
 
 
 def test_it_says_whose_rights_are_within_reach(helm: Helm) -> None:
-    words = f"Whoever may make FiberPools in {NAMESPACE} may run pods as any ServiceAccount there"
+    words = f"Accounts that may make FiberPools in {NAMESPACE} may run pods as any ServiceAccount"
     assert words in helm.notes({"scope": "namespaced"})
     assert words not in helm.notes(TWO)
 

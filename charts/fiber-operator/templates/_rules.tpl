@@ -7,7 +7,7 @@ calls that the operator makes, both ways.
   serving  the operator, where it shows that it serves: in each namespace that it watches, or in kube-public for all
   anyone   everybody who is logged in, in kube-public: whether an operator serves all namespaces
   user     programs that are masters: what the SDK calls, and nothing else
-  viewer   who looks on: people
+  viewer   people who only look
   smoke    the helm test
 */}}
 {{- define "fiber-operator.rules" -}}
