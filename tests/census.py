@@ -1,4 +1,4 @@
-"""Counts the processes that a test or a run started, however deep and whoever adopted them.
+"""Counts the processes that a test or a run started, at any depth and with any adopter.
 
 A process is found in two ways: as a descendant, and by a marker in the environment that it was
 executed with. The marker still finds an orphan, whose parent is gone; the descent still finds a

@@ -1,4 +1,4 @@
-"""What the rules never say, whatever the operator calls."""
+"""Rights that the rules never give, for any call of the operator."""
 
 from __future__ import annotations
 

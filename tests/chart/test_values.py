@@ -12,7 +12,7 @@ from chart import readme
 from chart.helm import CHART, Helm, Refused
 
 SCHEMA: dict[str, Any] = json.loads((CHART / "values.schema.json").read_text(encoding="utf-8"))
-# Helm passes these to every chart that is part of another, whatever they are.
+# Helm passes these to every chart that is part of another one.
 OPEN = {"global"}
 ALL: dict[str, Any] = {
     "scope": "namespaced",

@@ -164,7 +164,7 @@ class WarmPools:
 
 
 def _reserved_port() -> socket.socket:
-    """A port that the kernel gives nobody, and whoever names it can still listen on."""
+    """A port that the kernel gives to no process, but on which one that names it can listen."""
     sock = socket.socket()
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     sock.bind(("", 0))

@@ -22,7 +22,7 @@ def test_a_rule_that_is_broken_is_named(bad: Bad) -> None:
 
 @pytest.mark.parametrize("update", BAD_UPDATES, ids=lambda update: update.name)
 def test_rules_about_a_change_leave_both_ends_alone(update: BadUpdate) -> None:
-    # Whoever reads one object cannot know what it was before.
+    # A reader of one object cannot know what it was before.
     assert FiberPool.read(update.first()) != FiberPool.read(update.second())
 
 

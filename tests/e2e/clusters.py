@@ -2,7 +2,7 @@
 
 In this order:
 
-1. what KUBECONFIG names, whatever it is;
+1. the cluster that KUBECONFIG names;
 2. kind, where it is installed and docker runs;
 3. the project's own cluster (tests/cluster): Linux, root, Go;
 4. none, and then the tests are skipped, or fail where CI=true.

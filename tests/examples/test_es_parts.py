@@ -36,7 +36,7 @@ def test_equal_returns_have_equal_ranks(es: Any) -> None:
 
 
 def test_evolution_climbs(es: Any) -> None:
-    """On a function whose top is known, and whatever the order of the answers."""
+    """On a function whose top is known, and with any order of the answers."""
     rng = np.random.default_rng(0)
     noise = rng.standard_normal(10_000, dtype=np.float32)
     top = np.array([1.0, -2.0, 0.5], dtype=np.float32)

@@ -51,7 +51,7 @@ def test_scikit_learn_fits_and_searches(executor: fiber.Executor) -> None:
     alone = GridSearchCV(SVC(), {"C": [0.01, 10.0], "gamma": [1e-3]}, cv=2).fit(images, digits)
     with joblib.parallel_config(backend="fiber", executor=executor, n_jobs=2):
         grid.fit(images, digits)
-        # It shares memory with its tasks: joblib gives it threads, whatever the backend.
+        # It shares memory with its tasks: joblib gives it threads with every backend.
         forest = RandomForestClassifier(20, random_state=0, n_jobs=2).fit(images, digits)
     assert grid.best_params_ == {"C": 10.0, "gamma": 1e-3}
     np.testing.assert_array_equal(

@@ -65,7 +65,7 @@ class _End(asyncio.Transport):
 
 
 class MemoryConnector(aiohttp.BaseConnector):
-    """Connects to ``api``, whatever the address is."""
+    """Connects to ``api`` for every address."""
 
     def __init__(self, api: KubernetesApi) -> None:
         super().__init__(limit=0)

@@ -1,6 +1,6 @@
 """A program that uses Fiber, run as a process of its own that a test watches, breaks and counts.
 
-Everything that it starts carries its marker, so that what it left can be found whoever adopted it;
+Everything that it starts carries its marker, so that what it left can be found under any adopter;
 its temporary files lie in a folder of its own.
 """
 
@@ -150,7 +150,7 @@ class Program:
         return output
 
     def close(self) -> None:
-        """End whatever is left."""
+        """End all that is left."""
         self.process.kill()
         self.process.wait()
         census.kill(self.family())

@@ -29,7 +29,7 @@ def test_a_handle_that_nobody_took_holds_its_end_as_long_as_multiprocessings(
 ) -> None:
     """Nobody hears that the kernel threw a message away together with its pipe.
 
-    So whoever has lent an end keeps it for the taker that may come, until the program ends.
+    So a process that has sent an end keeps it for a later taker, until the program ends.
     """
     program = launch_on(UNTAKEN.format(library=library))
     assert program.line() == "False"

@@ -26,7 +26,7 @@ PASSES = 3
 
 
 class Names(Protocol):
-    """What the objects of whoever drives the ledger stand for."""
+    """Meaning of the objects of the ledger's driver."""
 
     def account(self, job: Job) -> Account | None:
         """Whose job it is; None if it is that of many."""
@@ -124,7 +124,7 @@ class Audit:
     def _check_turns(self, job: Job, given: WorkerEntry) -> None:
         """``job`` is given a worker: others that wait must get their turns."""
         workers = self._ledger.workers
-        # Another one with a single batch is kept free for whoever needs an idle worker.
+        # Another one with a single batch is kept free for callers that need an idle worker.
         passed = not any(len(worker.queue) == 1 for worker in workers if worker is not given)
         waiting = [other for other in self._ledger.jobs if other.has_next and other is not job]
         fair = PASSES * (len(self._ledger.jobs) + len(workers))
@@ -300,7 +300,7 @@ class Audit:
             for job, where in places.items()
             for place, first, size in where
         )
-        # Whoever runs a task that was cancelled is not there for others.
+        # A worker that runs a cancelled task takes no other.
         unwanted = sum(
             len(batch.items) - batch.received
             for batch in self._ledger.batches.values()
@@ -315,7 +315,7 @@ class Audit:
         for worker in self._ledger.workers:
             held += len(worker.queue)
             child = self._names.child(worker)
-            # Whoever uses it finds that out.
+            # Its user finds that out.
             require(worker.leased or not child.gone, f"{child.name} is gone, but not lost")
             require(not (worker.leased and worker.queue), f"{child.name} is leased and has a batch")
             require(len(worker.queue) <= 2, f"{child.name} has too many batches")

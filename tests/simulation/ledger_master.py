@@ -22,7 +22,7 @@ from simulation.world import World
 
 
 def for_ledger(schedule: Schedule) -> Schedule:
-    """Whoever drives it starts workers without a pause, so that there must be some that can."""
+    """Its driver starts workers without a pause, so some must be able to start."""
     faults = tuple(fault for fault in schedule.faults if not isinstance(fault, Famine))
     return replace(schedule, faults=faults)
 
@@ -359,7 +359,7 @@ class LedgerMaster:
         self._later(self._rng.choice((1e-5, 1e-3, 0.1)), self._return, worker)
 
     def _return(self, worker: engine.WorkerEntry) -> None:
-        """Whoever used it leaves it, and perhaps the answer that is still to come."""
+        """Its user leaves it, and perhaps an answer that has not come yet."""
         if worker not in self.ledger.workers:
             return
         self.world.note("%s is returned", worker.key.child.name)

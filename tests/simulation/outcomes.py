@@ -64,7 +64,7 @@ class Outcomes:
         return True
 
     def lift_bound(self) -> None:
-        """Whoever would read the results waits for the rest."""
+        """The reader of the results waits for the rest."""
         self._master.waits_for_all(self.account)
 
     def _put(self, ref: Ref, outcome: Any) -> None:

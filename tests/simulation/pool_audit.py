@@ -34,7 +34,7 @@ GRACE = 0.1
 """Seconds within which a pool must have started the workers that it needs."""
 
 PROMPTLY = 5 * max(MOMENTS)
-"""Seconds within which whoever waits for a thread and the loop must have heard."""
+"""Seconds within which a waiter for a thread and the loop must have an answer."""
 
 
 class Reading(NamedTuple):

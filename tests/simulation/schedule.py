@@ -75,7 +75,7 @@ class Crash:
 
 @dataclass(frozen=True, slots=True)
 class Kill:
-    """A worker dies at a certain time, whatever it does."""
+    """A worker dies at a certain time, busy or not."""
 
     worker: int
     at: float

@@ -208,7 +208,7 @@ class Actor:
         self._back.acquire()
 
     def abandon(self) -> None:
-        """End it, whatever it waits for."""
+        """End it, even while it waits."""
         if self._thread.is_alive():
             self._abandoned = True
             self._turn.release()
@@ -373,7 +373,7 @@ class StagedChannel:
             self._reader.wait(timeout)
             self._reader = None
         if self._stage.rng.random() < 0.03:
-            self._stage.world.note("whoever called %s is interrupted", self._child.name)
+            self._stage.world.note("the caller of %s is interrupted", self._child.name)
             raise Interrupted
         if self._received:
             message: Message = self._stage.world.language.message(self._received.popleft())
@@ -423,7 +423,7 @@ class StagedTaskChannel(RemoteTaskChannel):
         """The next packet; sometimes Ctrl-C comes first."""
         message = super().receive(timeout)
         if self._stage.rng.random() < 0.03:
-            self._stage.world.note("whoever called over there is interrupted")
+            self._stage.world.note("the caller over there is interrupted")
             raise Interrupted
         return message
 

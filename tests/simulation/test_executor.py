@@ -33,7 +33,7 @@ def test_what_a_leased_worker_answers_before_it_dies_counts(seed: int) -> None:
 
 
 class Late:
-    """A worker that is ready, and gone, before whoever started it could note how to reach it."""
+    """A worker that is ready, and gone, before its starter could note how to reach it."""
 
     def __init__(self) -> None:
         self.worker: WorkerEntry | None = None

@@ -216,7 +216,7 @@ def holds_nothing_back(patch: Patch) -> None:
 
 
 def acts_later(patch: Patch) -> None:
-    """Feeds calls, and leaves it to whatever happens next to give them out."""
+    """Feeds calls, and leaves it to the next event to give them out."""
 
     def _take(self: Calls, queue: CallQueue) -> None:
         advance, self._advance = self._advance, lambda: None

@@ -1,4 +1,4 @@
-"""The ledger keeps its promises whatever happens to workers, hosts and links."""
+"""The ledger keeps its promises through all faults of workers, hosts and links."""
 
 from __future__ import annotations
 

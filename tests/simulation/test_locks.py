@@ -1,4 +1,4 @@
-"""No token is ever held twice, and none is lost, whoever is killed or interrupted, at any step."""
+"""No token is held twice or lost, when a process is killed or interrupted at any step."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def run(seed: int, tokens: int, maximum: int) -> None:
                 else:
                     world.kill(process)
             world.finish()
-            # Whoever comes later gets all that there are.
+            # A later process gets all that are left.
             late = world.start(lambda _: acquires_all(make(), tokens))
             world.finish()
             for process in processes:

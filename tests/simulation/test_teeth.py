@@ -1,4 +1,4 @@
-"""The simulation finds what it is there to find: whatever is named here breaks one promise."""
+"""The simulation finds the faults that it is for: each fault here breaks one promise."""
 
 from __future__ import annotations
 

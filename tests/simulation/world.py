@@ -1,4 +1,4 @@
-"""One simulated run: time, hosts, workers, and whoever gives them work."""
+"""One simulated run: time, hosts, workers, and the master that gives them work."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class Loop(SimulatedLoop):
         """This one never fails."""
 
     def on_thread(self) -> bool:
-        """Whether whoever asks may take this for the loop's thread."""
+        """Whether the caller may take this for the loop's thread."""
         return self._thread is None
 
     @contextmanager
@@ -138,7 +138,7 @@ class Language(Protocol):
 
 
 class Master(Protocol):
-    """Whoever gives the workers work."""
+    """The master, which gives the workers work."""
 
     @property
     def language(self) -> Language:

@@ -62,7 +62,7 @@ def stand_in(package: str) -> Callable[[str], Any]:
 
 
 def attribute(name: str) -> Any:
-    """Whatever has this name."""
+    """The object of this name."""
     if name.startswith("__"):
         raise AttributeError(name)
     return _class(name)

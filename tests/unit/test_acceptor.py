@@ -233,7 +233,7 @@ def test_one_that_breaks_as_it_is_taken_stays_open_nowhere(site: Site) -> None:
     handshake = authentication.MasterHandshake(taken, context, site.credentials.certificate)
     with contextlib.closing(handshake.sock) as secured:
         fd = secured.fileno()
-        assert fd >= 0, "whoever goes on with it has it to close"
+        assert fd >= 0, "its next user has to close it"
     with pytest.raises(OSError, match="Bad file descriptor"):
         os.fstat(fd)
 

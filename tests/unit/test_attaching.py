@@ -1,4 +1,4 @@
-"""Whoever says that it has a handle says so after its hub knows: the grant may end then.
+"""A process reports that it has a handle after its hub knows: the grant may end then.
 
 Host ``a`` has the objects; this process is on host ``b``, and the link from there carries nothing
 until it is let go.

@@ -1,4 +1,4 @@
-"""Connections: multiprocessing's semantics, whoever holds the ends, and however they end."""
+"""Connections: multiprocessing's semantics, for all holders and all ways to end."""
 
 from __future__ import annotations
 

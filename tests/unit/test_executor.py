@@ -266,7 +266,7 @@ def test_a_batch_that_its_worker_cannot_read_is_sent_in_pieces(rig: Rig) -> None
 
 
 def test_a_finished_request_keeps_nothing(rig: Rig) -> None:
-    # Whoever waits for the collector waits long where large arrays count as one object each.
+    # A wait for the collector is long where large arrays count as one object each.
     gc.disable()
     try:
         found = [rig.map(range(2)), rig.map([]), rig.call(timeout=60.0), cancelled := Results()]

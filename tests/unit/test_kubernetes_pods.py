@@ -29,7 +29,7 @@ DAMAGED = "the loop is to fail in this test"
 
 
 class Said:
-    """An ``Output``, and whatever else of which nothing is wanted here, nor of what it returns."""
+    """An ``Output``, or another object whose methods and results do not matter here."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []

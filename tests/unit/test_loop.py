@@ -278,7 +278,7 @@ def test_a_call_after_the_end_writes_into_nobody_elses_descriptor() -> None:
     loop = Loop()
     loop.start_thread("short")
     loop.stop()
-    # Whatever opens next gets the numbers that the loop had.
+    # The next file to open gets the numbers that the loop had.
     others = [os.eventfd(0, os.EFD_NONBLOCK) for _ in range(4)]
     loop.call_soon(lambda: None)
     for fd in others:

@@ -285,7 +285,7 @@ def test_an_agent_that_cannot_be_replaced_at_once_is_replaced_later_and_that_is_
         monkeypatch.setattr(loopback.subprocess, "Popen", reluctant)
         os.kill(backend._slots[0].process.pid, signal.SIGKILL)  # type: ignore[arg-type]
         child.join(PATIENCE)
-        assert child.exitcode == -signal.SIGKILL, "its end is reported whatever comes after"
+        assert child.exitcode == -signal.SIGKILL, "its end is reported in any case"
         another = start()
         assert reluctant.left == 0
         stop(another)

@@ -27,7 +27,7 @@ Json = dict[str, Any]
 
 
 def test_a_lease_that_is_never_made_is_that_of_a_lost_master() -> None:
-    """Whoever died between making the pool and the Lease leaves nothing for ever."""
+    """A program that died between making the pool and the Lease leaves nothing for ever."""
     pool = tried(replicas=2, master=LEASED, onLost="Delete")
     soon = plan_of(pool, running(1), master=plans.LeaseVerdict(missing=True))
     assert (soon.delete_pool, soon.delete, soon.create) == (False, (), 1)

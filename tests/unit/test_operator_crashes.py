@@ -1,7 +1,7 @@
 """The operator is ended after each call that it makes, and started again.
 
-The call is carried out and its answer is lost, which is the worst moment.  Whatever the operator
-was about, the next one brings the pool where it should be: no pod twice, none forgotten, each
+The call is carried out and its answer is lost, which is the worst moment.  At any of these
+points the next operator brings the pool where it should be: no pod twice, none forgotten, each
 failure counted once, and what the operator itself deleted not taken for somebody else's doing.
 """
 

@@ -1,4 +1,4 @@
-"""Whatever call of the operator fails, a person reads it where they look: in the pool's status."""
+"""Each failed call of the operator can be read where people look: in the pool's status."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Of several operators one acts, whatever happens to it or to the API server."""
+"""One of several operators acts, through all faults of it and of the API server."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What holds of every plan, whatever the pool, its pods and its status are."""
+"""Properties of every plan, for any pool, pods and status."""
 
 from __future__ import annotations
 

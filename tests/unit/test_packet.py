@@ -1,4 +1,4 @@
-"""Packets: one message each, whole, whatever its size, and what belongs to it or nothing."""
+"""Packets: one whole message each, at every size, with all that belongs to it or nothing."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Entering a pool from anywhere: signal handlers, finalizers, forks; at any line of Fiber's code.
 
-A handler or a finalizer runs between two lines of whatever its thread is doing.  So these tests
+A handler or a finalizer runs between two lines of any code of its thread.  So these tests
 strike at lines: once at each of Fiber's that a thread passes.
 """
 

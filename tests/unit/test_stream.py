@@ -1,4 +1,4 @@
-"""The stream: every frame once and in order, whatever becomes of its connections."""
+"""The stream: every frame once and in order, through all faults of its connections."""
 
 from __future__ import annotations
 

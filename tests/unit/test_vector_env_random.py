@@ -1,4 +1,4 @@
-"""Whatever its environments are, ``VectorEnv`` gives what ``SyncVectorEnv`` gives.
+"""``VectorEnv`` gives what ``SyncVectorEnv`` gives, for all environments.
 
 ``RANDOM_VECTOR_ENVS`` is how many mixes of environments are played, by default a few.
 """

@@ -24,7 +24,7 @@ from .tiers import Tier, tier_of
 
 SOURCE = "test._test_multiprocessing"
 
-# Whatever the test module imports besides multiprocessing is loaded before the redirection.
+# The test module's other imports are loaded before the redirection.
 _SUPPORT = (
     "test.support",
     "test.support.hashlib_helper",

@@ -1,6 +1,6 @@
 """CPython's test classes, rebuilt for ``$MP_MODULE``; importing this module builds them.
 
-Children import it too, when they unpickle a target, so whatever is here must be reached by name.
+Children import it too, when they unpickle a target, so all names here must be importable.
 """
 
 from __future__ import annotations
