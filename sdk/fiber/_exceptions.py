@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from types import BuiltinFunctionType, GetSetDescriptorType, MemberDescriptorType
 from typing import Any, TypeVar, cast
+from weakref import WeakKeyDictionary
 
 _E = TypeVar("_E", bound=BaseException)
 
@@ -125,13 +126,21 @@ def _value(field: Any, error: BaseException) -> Any:
         return field
 
 
-def _fields(kind: type[BaseException]) -> Iterator[Any]:
+def _fields(kind: type[BaseException]) -> tuple[Any, ...]:
     """List the descriptors of what is not in the instance's dictionary."""
-    for base in kind.__mro__:
-        for name, found in vars(base).items():
-            is_field = isinstance(found, MemberDescriptorType | GetSetDescriptorType)
-            if is_field and not name.startswith("__"):
-                yield found
+    fields = _known_fields.get(kind)
+    if fields is None:
+        _known_fields[kind] = fields = tuple(
+            found
+            for base in kind.__mro__
+            for name, found in vars(base).items()
+            if isinstance(found, MemberDescriptorType | GetSetDescriptorType)
+            and not name.startswith("__")
+        )
+    return fields
+
+
+_known_fields: WeakKeyDictionary[type, tuple[Any, ...]] = WeakKeyDictionary()
 
 
 def report_uncaught() -> None:

@@ -232,6 +232,11 @@ class Chained(Exception):
         self.replaces = replaces
 
 
+class ReducedChain(Chained):
+    def __reduce__(self) -> tuple[Any, ...]:
+        return ReducedChain, (self.replaces,), vars(self)
+
+
 class CountsPickles:
     """Object that cannot be pickled, and counts the attempts."""
 

@@ -8,6 +8,7 @@ exception by its native base alone, and sets its arguments and attributes afterw
 
 from __future__ import annotations
 
+import builtins
 import copyreg
 import io
 import pickle
@@ -29,7 +30,19 @@ _NATIVE = (BuiltinFunctionType, MethodDescriptorType, WrapperDescriptorType)
 
 _Reduced = tuple[Any, ...] | str
 
-_MakePickler = Callable[[io.BytesIO, dict[type, Any]], pickle.Pickler]
+_Reduce = Callable[[Any], _Reduced]
+
+_MakePickler = Callable[[io.BytesIO, _Reduce], pickle.Pickler]
+
+_PLAIN_TYPES = frozenset((type(None), bool, int, float, complex, str, bytes))
+
+_PLAIN_ERRORS = frozenset(
+    kind
+    for kind in vars(builtins).values()
+    if isinstance(kind, type)
+    and issubclass(kind, BaseException)
+    and not issubclass(kind, BaseExceptionGroup)
+)
 
 
 def encode_error(error: BaseException) -> bytes:
@@ -152,25 +165,22 @@ def _attribute(error: BaseException, name: str) -> Any:
 
 
 def _pickled(error: BaseException) -> tuple[bytes | None, str]:
-    """Return a pickle that was checked to unpickle; or None, and the reason."""
-    reason = ""
-    for pickler, incomplete in (
-        (_by_name, False),
-        (by_reference.pickler, False),
-        (by_reference.pickler, True),
-    ):
-        try:
-            return _Pickling(pickler, incomplete=incomplete).checked(error), ""
-        except BaseException as refusal:  # kept as text: it would keep frames alive
-            reason = _shown(refusal)
-    return None, reason
+    """Return a pickle that is known to unpickle; or None, and the reason."""
+    if _is_plain(error) and not _fields(error):
+        return pickle.dumps(error, pickle.HIGHEST_PROTOCOL), ""
+    pickled = _Whole().pickled(error)
+    return pickled.data, pickled.reason
 
 
-def _by_name(file: io.BytesIO, reducers: dict[type, Any]) -> pickle.Pickler:
-    pickler: Any = ForkingPickler(file, pickle.HIGHEST_PROTOCOL)
-    pickler.dispatch_table = ChainMap(reducers, pickler.dispatch_table)
+def _by_name(file: io.BytesIO, reduce: _Reduce) -> pickle.Pickler:
+    pickler: Any = pickle.Pickler(file, pickle.HIGHEST_PROTOCOL)
+    pickler.dispatch_table = _Exceptions(reduce, _registered)
     made: pickle.Pickler = pickler
     return made
+
+
+def _by_reference(file: io.BytesIO, reduce: _Reduce) -> pickle.Pickler:
+    return by_reference.pickler(file, _Exceptions(reduce, {}))
 
 
 class _State(NamedTuple):
@@ -186,45 +196,133 @@ class _State(NamedTuple):
     def of(cls, error: BaseException) -> _State:
         own = _state_for_setstate(error)
         attributes = dict(vars(error) if own is None else own)
-        return cls(error.args, attributes, _fields(error), own is not None)
+        fields = _fields(error)
+        if isinstance(error, BaseExceptionGroup):
+            fields.pop("exceptions")  # It is made with them.
+        return cls(error.args, attributes, fields, own is not None)
+
+
+class _Pickled(NamedTuple):
+    data: bytes | None
+    """None: the exception cannot travel."""
+    reason: str
+    way: _Pickling | None = None
+    """Set if the pickle has handles. It can be used once then, and the next is made this way."""
+
+
+class _Whole:
+    """One exception with everything in it.
+
+    The members of a group are pickled separately, each in the first way that works for it, since
+    only some may unpickle at the receiver.  Plain members unpickle everywhere, and stay in the
+    pickle of their group.
+    """
+
+    def __init__(self) -> None:
+        self.separate: dict[int, int] = {}
+        """Group of each member that the present pickle has as a pickle in it."""
+        self.open: set[int] = set()
+        """Groups of which a member is being pickled: the member may contain its group."""
+        self.reduced: dict[int, tuple[BaseException, _Reduced]] = {}
+        """Exceptions reduced to the parts that can travel."""
+        self._pickled: dict[int, tuple[BaseException, _Pickled]] = {}
+        self._kinds: dict[type, _Kind | None] = {}
+        self._plainly = _Pickling(_by_name, self)
+
+    def member(self, error: BaseException) -> _Reduced:
+        """Reduce a separate member to its pickle, or to its state if that is plain."""
+        if _has_plain_state(error) and (kind := self._kind(type(error))) is not None:
+            return _received_of_kind, (kind, tuple(_State.of(error)), _shown(error))
+        group = self.separate[id(error)]
+        separate, self.separate = self.separate, {}
+        self.open.add(group)
+        try:
+            pickled = self.pickled(error)
+        finally:
+            self.separate = separate
+            self.open.discard(group)
+        return _received_member, (pickled.data, pickled.reason, _shown(error))
+
+    def _kind(self, kind: type[BaseException]) -> _Kind | None:
+        if kind not in self._kinds:
+            self._kinds[kind] = None
+            for dumps in (pickle.dumps, by_reference.dumps):
+                with suppress(Exception):
+                    data = dumps(kind)
+                    if pickle.loads(data) is kind:
+                        self._kinds[kind] = _Kind(data)
+                        break
+        return self._kinds[kind]
+
+    def pickled(self, error: BaseException) -> _Pickled:
+        """Pickle ``error``, and check that the pickle unpickles if no earlier one was checked."""
+        _, known = self._pickled.get(id(error), (None, None))
+        if known is not None:
+            return known if known.way is None else _Pickled(known.way.dumped(error), "")
+        pickled = self._checked(error)
+        self._pickled[id(error)] = error, pickled
+        return pickled
+
+    def _checked(self, error: BaseException) -> _Pickled:
+        reason = ""
+        for way in self._ways():
+            try:
+                if _is_plain(error):
+                    return _Pickled(way.dumped(error), "")
+                data, has_handles = way.checked(error)
+                return _Pickled(data, "", way if has_handles else None)
+            except BaseException as refusal:  # kept as text: it would keep frames alive
+                reason = _shown(refusal)
+        return _Pickled(None, reason)
+
+    def _ways(self) -> Iterator[_Pickling]:
+        yield self._plainly
+        yield _Pickling(_by_reference, self)
+        yield _Pickling(_by_reference, self, incomplete=True)
 
 
 class _Pickling:
     """Pickler of exceptions, and of objects that contain exceptions.
 
     With ``incomplete``, an exception travels without the parts that cannot travel, and has a note
-    that says so.  A group gets another exception in place of a member that cannot travel.
+    that says so.
     """
 
-    def __init__(self, pickler: _MakePickler, *, incomplete: bool = False) -> None:
+    def __init__(self, pickler: _MakePickler, whole: _Whole, *, incomplete: bool = False) -> None:
         self._pickler = pickler
+        self._whole = whole
         self._incomplete = incomplete
-        self._by_own_reduce: dict[int, BaseException] = {}
+        self._own_reduce_works: dict[int, tuple[BaseException, bool]] = {}
         self._open: set[int] = set()
         """Exceptions whose parts are being checked."""
-        self._met: set[int] = set()
-        """Open exceptions that are parts of the one being checked."""
-        self._checked: dict[int, tuple[BaseException, _Reduced]] = {}
-        self._apart: set[int] | None = None
-        """Groups whose members are being pickled separately; None while pickles are checked."""
+        self._idle: tuple[io.BytesIO, pickle.Pickler] | None = None
 
-    def checked(self, error: BaseException) -> bytes:
-        """Pickle ``error``, and unpickle it as a check.
-
-        The members of a group are then pickled separately, as only some may unpickle at the
-        receiver.
-        """
+    def checked(self, error: BaseException) -> tuple[bytes, bool]:
+        """Pickle ``error``, and unpickle it as a check; return whether the pickle has handles."""
         data, has_handles = self._trial(error)
-        if isinstance(error, BaseExceptionGroup):
-            self._apart = set()
-            return self._dumped(error)
         # The handles in a trial pickle end with the trial.
-        return self._dumped(error) if has_handles else data
+        return self.dumped(error) if has_handles else data, has_handles
+
+    def dumped(self, obj: Any) -> bytes:
+        """Pickle ``obj``."""
+        (file, pickler), self._idle = self._idle or self._made(), None
+        pickler.dump(obj)
+        data = file.getvalue()
+        if self._pickler is _by_name:  # A pickler of cloudpickle is for one pickle.
+            pickler.clear_memo()
+            file.seek(0)
+            file.truncate()
+            self._idle = file, pickler
+        return data
+
+    def _made(self) -> tuple[io.BytesIO, pickle.Pickler]:
+        file = io.BytesIO()
+        return file, self._pickler(file, self._reduce)
 
     def _trial(self, obj: Any) -> tuple[bytes, bool]:
         """Pickle and unpickle ``obj``; return the pickle, and whether it has handles."""
         with collecting_grants() as grants:
-            data = self._dumped(obj)
+            data = self.dumped(obj)
             copy = pickle.loads(data)
             if isinstance(obj, BaseException):
                 _exception(copy)
@@ -232,77 +330,46 @@ class _Pickling:
             grants.release()
         return data, has_handles
 
-    def _dumped(self, obj: Any) -> bytes:
-        file = io.BytesIO()
-        self._pickler(file, _Exceptions(self._reduce)).dump(obj)
-        return file.getvalue()
-
     def _reduce(self, error: BaseException) -> _Reduced:
-        reduced = self._reduce_whole(error)
-        if self._apart is None or id(error) in self._apart:
-            return reduced
-        if isinstance(reduced, str) or reduced[0] is not make:
-            return reduced
-        _, (kind, group), state, *_ = reduced
-        if not group:
-            return reduced
-        self._apart.add(id(error))  # A member may contain its group.
-        try:
-            members = {id(each): _Member(self._dumped(each), _shown(each)) for each in group[1]}
-        finally:
-            self._apart.remove(id(error))
-        return _rebuilt(kind, *_with_members(group, _State(*state), members))
-
-    def _reduce_whole(self, error: BaseException) -> _Reduced:
-        kind = type(error)
-        if id(error) in self._checked:
-            return self._checked[id(error)][1]
-        if id(error) in self._by_own_reduce or not (self._incomplete or _needs_rebuilding(error)):
+        if id(error) in self._whole.separate:
+            return self._whole.member(error)
+        if id(error) in self._open:  # It is checked already, and need not be complete here.
+            return make, (type(error), group_of(error))
+        if self._incomplete and id(error) in self._whole.reduced:
+            return self._whole.reduced[id(error)][1]
+        if not (self._incomplete or _needs_rebuilding(error)):
             return _own_reduced(error)
-        if _has_own_reduce(kind):
-            self._by_own_reduce[id(error)] = error
-            if not self._refusal(error):
-                return _own_reduced(error)
-            del self._by_own_reduce[id(error)]
+        if _has_own_reduce(type(error)) and self._reduces_itself(error):
+            return _own_reduced(error)
+        group = group_of(error)
+        if group and id(error) not in self._whole.open:
+            others = (member for member in group[1] if not _is_plain(member))
+            self._whole.separate.update((id(member), id(error)) for member in others)
         state = _State.of(error)
-        if self._incomplete and id(error) not in self._open:
-            return self._reduce_checked(error, state)
-        self._met.add(id(error))
-        return _rebuilt(kind, group_of(error), state)
-
-    def _reduce_checked(self, error: BaseException, state: _State) -> _Reduced:
-        """Reduce an exception to the parts that can travel.
-
-        The outcome is kept, since a part is pickled again at each check of the whole.
-        """
-        met, self._met = self._met, set()
-        self._open.add(id(error))
-        try:
-            group, state = self._without_refused_members(error, state)
-            state = self._without_refused(state)
-        finally:
-            self._open.remove(id(error))
-            is_in_cycle = bool(self._met)  # Then the outcome depends on where the check began.
-            self._met = met | self._met - {id(error)}
-        reduced = _rebuilt(type(error), group, state)
-        if not is_in_cycle:
-            self._checked[id(error)] = error, reduced
+        if self._incomplete:
+            state = self._without_refused(error, state)
+        reduced = make, (type(error), group), tuple(state), None, None, _set_state
+        if self._incomplete:
+            # A part is pickled again at each check of what contains it.
+            self._whole.reduced[id(error)] = error, reduced
         return reduced
 
-    def _without_refused_members(
-        self, error: BaseException, state: _State
-    ) -> tuple[tuple[Any, ...], _State]:
-        """Replace the members of a group that cannot travel by errors that say why."""
-        if not isinstance(error, BaseExceptionGroup):
-            return (), state
-        sent: dict[int, object] = {}
-        for member in error.exceptions:
-            refusal = self._refusal(member)
-            sent[id(member)] = unsendable(_Text(refusal), member) if refusal else member
-        return _with_members(group_of(error), state, sent)
+    def _reduces_itself(self, error: BaseException) -> bool:
+        """Return whether the ``__reduce__`` of the program works."""
+        if id(error) not in self._own_reduce_works:
+            self._own_reduce_works[id(error)] = error, True  # for the check
+            self._own_reduce_works[id(error)] = error, not self._refusal(error)
+        return self._own_reduce_works[id(error)][1]
 
-    def _without_refused(self, state: _State) -> _State:
+    def _without_refused(self, error: BaseException, state: _State) -> _State:
         """Drop attributes that cannot travel, and turn such arguments into text; note both."""
+        self._open.add(id(error))
+        try:
+            return self._parts(state)
+        finally:
+            self._open.remove(id(error))
+
+    def _parts(self, state: _State) -> _State:
         notes = []
         for values in (state.attributes, state.fields):
             for name, value in [*values.items()]:
@@ -320,6 +387,8 @@ class _Pickling:
         return state._replace(args=tuple(kept))
 
     def _refusal(self, value: Any) -> str:
+        if type(value) in _PLAIN_TYPES:
+            return ""
         try:
             self._trial(value)
         except BaseException as error:
@@ -328,52 +397,51 @@ class _Pickling:
 
 
 class _Exceptions(dict[type, Callable[[Any], _Reduced]]):
-    """Part of a dispatch table that has every class of exceptions."""
+    """Dispatch table that has every class of exceptions, and what is in ``others``."""
 
-    def __init__(self, reduce: Callable[[Any], _Reduced]) -> None:
+    def __init__(self, reduce: _Reduce, others: Mapping[type, Callable[[Any], _Reduced]]) -> None:
         self._reduce = reduce
+        self._others = others
 
     def __missing__(self, kind: type) -> Callable[[Any], _Reduced]:
-        if issubclass(kind, BaseException):
-            return self._reduce
-        raise KeyError(kind)
+        return self._reduce if issubclass(kind, BaseException) else self._others[kind]
 
 
-class _Member:
-    """Placeholder of a member of a group: if it does not unpickle, an error that shows it."""
+class _Kind:
+    """Placeholder of a class in a pickle: if it does not unpickle, a text that says why."""
 
-    def __init__(self, data: bytes, shown: str) -> None:
-        self._parts = data, shown
+    def __init__(self, data: bytes) -> None:
+        self._data = data
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _received_member, self._parts
+        return _received_kind, (self._data,)
 
 
-def _received_member(data: bytes, shown: str) -> BaseException:
+def _received_kind(data: bytes) -> Any:
+    try:
+        return pickle.loads(data)
+    except Exception as refusal:
+        return _Text(_shown(refusal))
+
+
+def _received_of_kind(kind: Any, state: tuple[Any, ...], shown: str) -> BaseException:
+    """Return a member of a group that has a plain state, as ``_received_member`` does."""
+    try:
+        error: BaseException = make(kind, ())
+        _set_state(error, state)
+    except Exception as refusal:
+        return unsendable(kind if isinstance(kind, _Text) else refusal, _Text(shown))
+    return error
+
+
+def _received_member(data: bytes | None, reason: str, shown: str) -> BaseException:
+    """Return a member of a group: if it does not unpickle, an error that shows it."""
+    if data is None:
+        return unsendable(_Text(reason), _Text(shown))
     try:
         return _exception(pickle.loads(data))
     except Exception as refusal:
         return unsendable(refusal, _Text(shown))
-
-
-def _with_members(
-    group: tuple[Any, ...], state: _State, members: Mapping[int, object]
-) -> tuple[tuple[Any, ...], _State]:
-    """Put ``members`` in the places of the earlier members with these ids."""
-    args = tuple(
-        type(arg)(members.get(id(each), each) for each in arg)
-        if type(arg) in (list, tuple)
-        else arg
-        for arg in state.args
-    )
-    fields = {name: value for name, value in state.fields.items() if name != "exceptions"}
-    message, earlier = group
-    group = message, tuple(members[id(member)] for member in earlier)
-    return group, state._replace(args=args, fields=fields)
-
-
-def _rebuilt(kind: type, group: tuple[Any, ...], state: _State) -> _Reduced:
-    return make, (kind, group), tuple(state), None, None, _set_state
 
 
 def _set_state(error: BaseException, state: tuple[Any, ...]) -> None:
@@ -404,6 +472,34 @@ def _state_for_setstate(error: BaseException) -> dict[str, Any] | None:
     return state if isinstance(state, dict) else None
 
 
+def _is_plain(error: BaseException) -> bool:
+    """Return whether ``error`` unpickles in every process: no code of the program takes part."""
+    kind = type(error)
+    if kind not in _PLAIN_ERRORS or _reducer(kind):
+        return False
+    return _has_plain_values(error)
+
+
+def _has_plain_state(error: BaseException) -> bool:
+    """Return whether only the class of ``error`` can keep it from being made again."""
+    kind = type(error)
+    return (
+        not isinstance(error, BaseExceptionGroup)
+        and all(
+            isinstance(method, _NATIVE) for method in (kind.__setstate__, kind.__getattribute__)
+        )
+        and not _has_own_reduce(kind)
+        and _has_plain_values(error)
+    )
+
+
+def _has_plain_values(error: BaseException) -> bool:
+    attributes = {**vars(error), **_fields(error)}
+    notes = attributes.pop("__notes__", [])
+    values = (*error.args, *attributes.values(), *(notes if type(notes) is list else (notes,)))
+    return all(type(value) in _PLAIN_TYPES for value in values)
+
+
 def _needs_rebuilding(error: BaseException) -> bool:
     """Return whether plain pickle may run code in Python, or lose a field."""
     kind = type(error)
@@ -418,7 +514,7 @@ def _needs_rebuilding(error: BaseException) -> bool:
 def _has_own_reduce(kind: type[BaseException]) -> bool:
     reduce: Any = kind.__reduce__
     return (
-        kind in _registered
+        _reducer(kind) is not None
         or kind.__reduce_ex__ is not object.__reduce_ex__
         or not isinstance(reduce, _NATIVE)
         or getattr(reduce, "__objclass__", kind).__module__ != "builtins"
@@ -426,8 +522,14 @@ def _has_own_reduce(kind: type[BaseException]) -> bool:
 
 
 def _own_reduced(error: BaseException) -> _Reduced:
-    registered = _registered.get(type(error))
-    return registered(error) if registered else error.__reduce_ex__(pickle.HIGHEST_PROTOCOL)
+    reducer = _reducer(type(error))
+    return reducer(error) if reducer else error.__reduce_ex__(pickle.HIGHEST_PROTOCOL)
+
+
+def _reducer(kind: type) -> Callable[[Any], _Reduced] | None:
+    """Return the function that is registered for instances of ``kind``."""
+    tables: tuple[Any, ...] = cast("Any", ForkingPickler)._extra_reducers, copyreg.dispatch_table
+    return next((table[kind] for table in tables if kind in table), None)
 
 
 _registered: Mapping[type, Callable[[Any], _Reduced]] = ChainMap(
