@@ -23,6 +23,7 @@ from fiber._hub.dealer import Dealer
 from fiber._hub.hosted import HostedReceiver
 from fiber._hub.local import LocalChannel
 from fiber._hub.one_way import AMBIGUOUS, Receiver, Sender
+from fiber._transport import channels
 from fiber._wire import packet
 from fiber.errors import ConnectionClosed
 from hosts import PATIENCE, Far, background
@@ -47,6 +48,20 @@ def is_readable(channel: Receiver) -> bool:
     poller = select.poll()
     poller.register(channel.fileno(), select.POLLIN)
     return bool(poller.poll(0))
+
+
+def test_a_pair_makes_each_socket_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = []
+
+    class Counted(channels.BorrowedSocket):
+        def __init__(self, owner: Any) -> None:
+            made.append(owner)
+            super().__init__(owner)
+
+    monkeypatch.setattr(channels, "BorrowedSocket", Counted)
+    for end in one_way.pair():
+        end.close()
+    assert len(made) == 2
 
 
 def overflow(sender: Sender, count: int = MORE_THAN_A_SOCKET) -> None:

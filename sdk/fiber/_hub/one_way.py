@@ -37,7 +37,7 @@ from fiber._hub import heap
 from fiber._hub.local import LocalChannel
 from fiber._hub.protocol import ObjectKind
 from fiber._sync.liveness import RobustMutex
-from fiber._transport.channels import BorrowedSocket, wait_readable, wait_until
+from fiber._transport.channels import BorrowedSocket, connected, wait_readable, wait_until
 from fiber._wire import packet
 from fiber._wire.descriptor import Descriptor
 from fiber._wire.memory_files import BytesLike
@@ -160,6 +160,7 @@ _DONTWAIT = int(socket.MSG_DONTWAIT)
 _PEEK = int(socket.MSG_PEEK) | _DONTWAIT
 _IS_WAKE_UP = bytes([packet.WAKE_UP])
 _INT = struct.Struct("i")
+_RECEIVE_TIMEOUT = struct.pack("ll", int(LOOK_AGAIN), 0)
 
 
 class OneWayEnd(LocalChannel):
@@ -399,11 +400,11 @@ ENDS: dict[ObjectKind, type[Sender | Receiver]] = {
 def pair() -> tuple[Receiver, Sender]:
     """Return the two ends of a new channel."""
     backlog = Backlog.create()  # first: an error in there must not keep the sockets open
-    one, other = LocalChannel.pair()
-    backlog.words[ROOM] = other.sock.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF)
-    limit = struct.pack("ll", int(LOOK_AGAIN), 0)
-    one.sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, limit)
-    return Receiver(one.owner, backlog), Sender(other.owner, backlog)
+    one, other = connected()
+    receiver, sender = Receiver(one, backlog), Sender(other, backlog)
+    backlog.words[ROOM] = sender.sock.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF)
+    receiver.sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, _RECEIVE_TIMEOUT)
+    return receiver, sender
 
 
 def _wake_up(sock: socket.socket, words: memoryview) -> None:

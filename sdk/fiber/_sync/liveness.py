@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import ctypes
 import errno
+import functools
 import os
 import time
 from collections.abc import Callable
@@ -88,12 +89,7 @@ class RobustMutex:
 
     def create(self) -> None:
         """Make it.  Recursive: a finalizer may come in the middle of what it guards."""
-        attributes = ctypes.create_string_buffer(MUTEX_SIZE)
-        _check(_libc.pthread_mutexattr_init(attributes))
-        _check(_libc.pthread_mutexattr_setpshared(attributes, _SHARED))
-        _check(_libc.pthread_mutexattr_setrobust(attributes, _ROBUST))
-        _check(_libc.pthread_mutexattr_settype(attributes, _RECURSIVE))
-        _check(_libc.pthread_mutex_init(self._address, attributes))
+        _check(_libc.pthread_mutex_init(self._address, _attributes()))
 
     def run(self, action: Callable[[], _Result]) -> _Result:
         """Call ``action`` under the mutex; return its result."""
@@ -113,6 +109,16 @@ class RobustMutex:
         finally:
             if outcomes and outcomes[-1] in (0, errno.EOWNERDEAD):
                 _libc.pthread_mutex_unlock(self._address)
+
+
+@functools.cache
+def _attributes() -> ctypes.Array[ctypes.c_char]:
+    attributes = ctypes.create_string_buffer(MUTEX_SIZE)
+    _check(_libc.pthread_mutexattr_init(attributes))
+    _check(_libc.pthread_mutexattr_setpshared(attributes, _SHARED))
+    _check(_libc.pthread_mutexattr_setrobust(attributes, _ROBUST))
+    _check(_libc.pthread_mutexattr_settype(attributes, _RECURSIVE))
+    return attributes
 
 
 def _check(code: int) -> None:

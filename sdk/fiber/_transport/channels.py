@@ -169,6 +169,13 @@ def socketpair(doing: str) -> tuple[socket.socket, socket.socket]:
     return pair
 
 
+def connected() -> tuple[Descriptor, Descriptor]:
+    """Open two connected packet sockets, and return their owners."""
+    with naming_the_limit("opening a pipe"):
+        # socket.socketpair() is several steps, with the descriptors in between as numbers.
+        return opened_pair(_socket.socketpair, socket.AF_UNIX, socket.SOCK_SEQPACKET)
+
+
 def _block(sock: socket.socket) -> None:
     if sock.gettimeout() is not None:  # socket.setdefaulttimeout() is for the user's own
         sock.settimeout(None)
@@ -235,9 +242,7 @@ class UnixChannel:
     @classmethod
     def pair(cls) -> tuple[Self, Self]:
         """Two connected ends."""
-        with naming_the_limit("opening a pipe"):
-            # socket.socketpair() is several steps, with the descriptors in between as numbers.
-            one, other = opened_pair(_socket.socketpair, socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        one, other = connected()
         return cls(one), cls(other)
 
     @classmethod
