@@ -211,7 +211,7 @@ class _Pickled(NamedTuple):
 
 
 class _Whole:
-    """One exception with everything in it.
+    """Exception with everything in it.
 
     The members of a group are pickled separately, each in the first way that works for it, since
     only some may unpickle at the receiver.  Plain members unpickle everywhere, and stay in the
