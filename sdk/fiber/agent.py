@@ -11,6 +11,8 @@ It takes everything from its environment, nothing from its command line (but ``-
                            pod ``FIBER_AGENT_NAME``, ``FIBER_AGENT_UID`` to that file, and end
 ``FIBER_AGENT_PARENT``       optional: the pid of a process on this host to end with
 ``FIBER_AGENT_INHERITS``     optional: a directory of that process, to be removed if it is killed
+``FIBER_AGENT_DIRECTORY``    optional: the directory to make for the agent's socket
+``FIBER_AGENT_REPORT``       optional: a file for the reason of a failure, beside stderr
 ``FIBER_AGENT_LOST_GRACE``   optional: serve one master after the other.  Wait for the first for as
                            long as it takes, and after one that was lost for so many seconds,
                            unless that master had said for how many

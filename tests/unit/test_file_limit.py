@@ -47,6 +47,23 @@ with fiber.Pool(1) as pool:
     assert done.stdout == f"{refused}{refused}100000\n{refused}", done.stderr
 
 
+def test_a_program_whose_agents_cannot_start_hears_why_without_a_traceback() -> None:
+    done = run_program(
+        f"""{LIMIT}
+limit(1 << 19)
+try:
+    with fiber.Pool(1) as pool:
+        pool.apply(abs, (-3,))
+except fiber.StartError as error:
+    print(error)
+""",
+        {"FIBER_BACKEND": "loopback"},
+    )
+    assert "file too large while starting an agent" in done.stdout, done.stderr
+    assert "Raise that with `ulimit -f`" in done.stdout
+    assert "Traceback" not in done.stderr
+
+
 def test_a_program_that_cannot_start_hears_why() -> None:
     done = run_program(f"""{LIMIT}
 limit(1 << 10)

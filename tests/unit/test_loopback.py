@@ -31,8 +31,9 @@ from fiber._engine import start_failures
 from fiber._engine.start_failures import TRIES
 from fiber._hub.protocol import HubAddress
 from fiber._runtime import state
+from fiber._transport import listener
 from fiber._wire import messages
-from fiber.errors import LinkError, StartError
+from fiber.errors import LinkError, StartError, TooManyOpenFiles
 from memory_link import SimulatedLoop
 from patience import PATIENCE
 from unit.agent_children import ReadLink, Recorder, run_forever
@@ -295,6 +296,35 @@ def test_an_agent_that_cannot_be_replaced_at_once_is_replaced_later_and_that_is_
     assert "next attempt in 0.2 s" in said
 
 
+@pytest.mark.parametrize(
+    "error", [TooManyOpenFiles("making a link"), LinkError("no memory is left for a link")]
+)
+def test_a_program_that_has_not_the_means_to_serve_agents_says_so_soon(
+    monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    def refuse(loop: object, descriptor: int, *rest: object, **options: object) -> None:
+        os.close(descriptor)
+        raise error
+
+    monkeypatch.setattr(start_failures, "KILLED_PATIENCE", 0.0)
+    monkeypatch.setattr(listener, "SealedConnection", refuse)
+    with running(), pytest.raises(StartError) as caught:
+        stop(start())
+    message = str(caught.value)
+    assert "this program cannot serve them" in message
+    assert str(error) in message
+
+
+def test_a_system_that_starts_no_agents_is_not_asked_for_minutes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(start_failures, "KILLED_PATIENCE", 0.0)
+    monkeypatch.setattr(loopback, "_LAUNCHING", 0.0)
+    monkeypatch.setattr(loopback.subprocess, "Popen", Reluctant(1000, errno.EMFILE))
+    with running(), pytest.raises(StartError, match="Too many open files"):
+        stop(start())
+
+
 @pytest.mark.slow
 def test_the_loop_does_not_wait_for_a_process_to_start(monkeypatch: pytest.MonkeyPatch) -> None:
     with running() as backend:
@@ -385,6 +415,20 @@ def test_it_leaves_no_file(tmp_path: Any) -> None:
         stop(start())
         assert "key" not in " ".join(path.name for path in tmp_path.rglob("*"))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_directory_of_an_agent_that_was_killed_while_it_made_it_is_removed(
+    tmp_path: Any,
+) -> None:
+    with running(runtime_directory=str(tmp_path)) as backend:
+        process = backend._slots[0].process
+        assert census.wait_until(lambda: process.pid is not None, PATIENCE)
+        directory = process._files.directory
+        assert directory is not None
+        assert os.path.dirname(directory) == str(tmp_path)
+        os.mkdir(directory)
+        os.kill(process.pid, signal.SIGKILL)  # type: ignore[arg-type]
+        assert census.wait_until(lambda: not os.path.exists(directory), PATIENCE)
 
 
 def test_agents_that_do_not_answer_share_one_deadline_at_the_end(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import math
 import os
@@ -21,6 +22,7 @@ from fiber._agent.service import AgentService
 from fiber._hub.directory import remove_directory
 from fiber._hub.hub import Hub
 from fiber._transport.authentication import Identity
+from fiber._transport.channels import naming_the_limit
 from fiber._transport.credentials import Credentials
 from fiber._transport.dialer import AgentDialer
 from fiber._transport.link import Link
@@ -32,6 +34,8 @@ _CREDENTIALS = "FIBER_AGENT_CREDENTIALS"
 _DESCRIPTOR = "fd:"
 _PARENT = "FIBER_AGENT_PARENT"
 _INHERITS = "FIBER_AGENT_INHERITS"
+_DIRECTORY = "FIBER_AGENT_DIRECTORY"
+_REPORT = "FIBER_AGENT_REPORT"
 _LOST_GRACE = "FIBER_AGENT_LOST_GRACE"
 _WAITS_UNTIL = "FIBER_AGENT_WAITS_UNTIL"  # time.monotonic(), from an agent to its next life
 
@@ -104,8 +108,10 @@ class Main:
         self._told_to_end = False
         # From here on there is a directory, which must be removed at a SIGTERM too.
         signal.signal(signal.SIGTERM, self._on_sigterm)
-        self._hub = Hub(self._loop, self._name, config.current().runtime_directory)
-        self._agent = Agent(self._loop, self._name, self._hub)
+        parent, directory = config.current().runtime_directory, os.environ.pop(_DIRECTORY, None)
+        self._hub = Hub(self._loop, self._name, parent, directory)
+        with naming_the_limit("starting an agent"):
+            self._agent = Agent(self._loop, self._name, self._hub)
 
     def run(self) -> int:
         """Serve until the end; return the exit status."""
@@ -169,7 +175,7 @@ class Main:
         return max(self._waits_until - time.monotonic(), 0.0)
 
     def _complain(self, what: object) -> None:
-        print(f"fiber agent {self._name}: {what}", file=sys.stderr, flush=True)
+        _complain(f"fiber agent {self._name}", what)
 
     def _joined(self, link: Link) -> None:
         leftovers.keep_search_path()  # before the first task
@@ -333,8 +339,16 @@ def main() -> int:
     try:
         return Main().run()
     except (FiberError, AuthenticationError) as error:
-        print(f"fiber agent: {error}", file=sys.stderr)
+        _complain("fiber agent", error)
         return 1
+
+
+def _complain(who: str, what: object) -> None:
+    print(f"{who}: {what}", file=sys.stderr, flush=True)
+    # The master reads the file when this process has ended.
+    if (path := os.environ.get(_REPORT)) is not None:
+        with contextlib.suppress(OSError), open(path, "w", errors="replace") as file:
+            file.write(str(what))
 
 
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_THRESHOLD = -1, -2, -3  # malloc.h

@@ -29,6 +29,7 @@ from fiber._backends.output import Output
 from fiber._backends.remote import RemoteAgent, RemoteChild
 from fiber._engine.placement import Placement
 from fiber._engine.start_failures import StartFailure, StartFailures
+from fiber._hub.directory import remove_directory
 from fiber._hub.hub import Hub
 from fiber._transport.authentication import Identity, join_address
 from fiber._transport.credentials import Credentials, make_credentials
@@ -45,6 +46,9 @@ _EXPECTED_FOR = 5.0
 """Seconds from an agent's start for which the others leave it its share of the children."""
 
 _LOOPBACK = "127.0.0.1"
+
+_LAUNCHING = 3.0
+"""Seconds to try to start one process.  Then that counts as a failed start."""
 
 _QUIT_TIMEOUT = 5.0
 """Seconds for all agents together to end by themselves."""
@@ -72,7 +76,7 @@ class LoopbackBackend:
         self._config = config
         self._output = Output()
         self._failures = StartFailures()
-        self._reasons: deque[str] = deque(maxlen=_REASONS)
+        self._reasons: deque[tuple[str, str]] = deque(maxlen=_REASONS)
         self._gave_up = False
         self._alone_since = 0.0
         self._retry: ScheduledCall | None = None
@@ -102,10 +106,11 @@ class LoopbackBackend:
             on_agent=self._joined,
             objection=self._objection,
             on_refused=self._refused,
+            on_unserved=self._unserved,
             keepalive=Keepalive(config.heartbeat_interval, config.suspect_after, config.lost_after),
         )
         self._launcher = AgentLauncher(
-            config.start_timeout,
+            min(config.start_timeout, _LAUNCHING),
             lambda trouble: self._output.write("fiber", trouble),
         )
         for index in range(config.agents):
@@ -144,14 +149,24 @@ class LoopbackBackend:
     def _launch(self, index: int) -> None:
         # A name is never used again: what comes late from its last holder is not for the next.
         name = f"loopback-{next(self._numbers)}"
-        process = AgentProcess(self._loop, partial(self._ended, name), self.elsewhere)
+        files = self._files(name)
+        process = AgentProcess(self._loop, partial(self._ended, name), files, self.elsewhere)
         self._by_name[name] = slot = _Slot(
             index, name, process, self._loop.now(), secrets.token_hex(8)
         )
         self._slots[index : index + 1] = [slot]
         credentials = self._credentials.agent(name, slot.uid)
-        self._launcher.launch(process, credentials, self._environment(name))
+        environment = {**self._environment(name), **files.variables()}
+        self._launcher.launch(process, credentials, environment)
         self._loop.call_later(_EXPECTED_FOR, self._expect)
+
+    def _files(self, name: str) -> _Files:
+        """Choose the files of an agent, so that they are removed whenever the agent is killed."""
+        ours = os.path.dirname(self._hub.address_or_problem.path)
+        if not ours:
+            return _Files()
+        directory = os.path.join(os.path.dirname(ours), f"fiber-{secrets.token_hex(4)}")
+        return _Files(directory, os.path.join(ours, f"report-{name}"))
 
     def _environment(self, name: str) -> dict[str, str]:
         environment = dict(os.environ)
@@ -186,6 +201,12 @@ class LoopbackBackend:
     def _refused(self, reason: str) -> None:
         if not self._closing:  # else it may be one of ours, ended before it was in
             self._output.write("fiber", f"refused an agent: {reason}")
+
+    def _unserved(self, name: str, reason: str) -> None:
+        """End an agent that this program cannot serve, for want of memory or descriptors."""
+        if name in self._by_name and name not in self.agents.agents and not self._closing:
+            self._vacate(name)
+            self._failed(name, reason, killed=True, what="this program cannot serve them")
 
     def _shut_down(self) -> None:
         for slot in [*self._slots, *self._departing.values()]:
@@ -226,11 +247,12 @@ class LoopbackBackend:
         slot.process.kill()
         self._vacant.append(slot)
 
-    def _failed(self, name: str, reason: str, killed: bool) -> None:
+    def _failed(self, name: str, reason: str, killed: bool, what: str = "none joined") -> None:
         now = self._loop.now()
-        self._reasons.append(f"{name}: {reason}")
-        text = "\n".join(self._reasons)
-        failure = StartFailure("the loopback agents", "none joined", text, killed)
+        if reason not in [earlier for _, earlier in self._reasons]:
+            self._reasons.append((name, reason))
+        text = "\n".join(f"{name}: {reason}" for name, reason in self._reasons)
+        failure = StartFailure("the loopback agents", what, text, killed)
         at_work = bool(self.agents.agents)
         self._failures.add(failure, now, at_work=at_work)
         if not at_work and self._failures.last(failure, now, self._alone_since):
@@ -294,6 +316,37 @@ class _Slot(NamedTuple):
     uid: str
 
 
+class _Files(NamedTuple):
+    """Files of an agent; None if they are not known beforehand."""
+
+    directory: str | None = None
+    """Directory of its hub."""
+    report: str | None = None
+    """File in which it says why it failed."""
+
+    def variables(self) -> dict[str, str]:
+        """Return the environment variables by which the agent gets the names."""
+        values = {"FIBER_AGENT_DIRECTORY": self.directory, "FIBER_AGENT_REPORT": self.report}
+        return {name: value for name, value in values.items() if value is not None}
+
+    def reason(self) -> str:
+        """Return why the agent failed, and remove the file; empty if it did not say."""
+        if self.report is None:
+            return ""
+        try:
+            with open(self.report, errors="replace") as file:
+                text = file.read()
+            os.unlink(self.report)
+        except OSError:
+            return ""
+        return text.strip()
+
+    def remove(self) -> None:
+        """Remove what an agent that was killed has left."""
+        if self.directory is not None:
+            remove_directory(self.directory)
+
+
 _PAUSE_MIN, _PAUSE_MAX = 0.1, 5.0
 """Seconds from one attempt to start a process to the next, growing."""
 
@@ -311,10 +364,15 @@ class AgentProcess:
     """
 
     def __init__(
-        self, loop: Loop, on_end: Callable[[str, bool], None], directory: str | None = None
+        self,
+        loop: Loop,
+        on_end: Callable[[str, bool], None],
+        files: _Files | None = None,
+        directory: str | None = None,
     ) -> None:
         """``directory``: the one to start it in, if that is not this program's."""
         self._loop = loop
+        self._files = files or _Files()
         self._directory = directory
         self._on_end = on_end
         self._lock = threading.Lock()
@@ -381,6 +439,7 @@ class AgentProcess:
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
+        self._files.remove()
 
     def _ended(self) -> None:
         assert self._process is not None
@@ -389,7 +448,10 @@ class AgentProcess:
             return
         self._loop.unregister(self._watched)
         os.close(self._watched)
-        self._on_end(f"its process ended with status {status}", status < 0)
+        self._files.remove()
+        how = f"its process ended with status {status}"
+        reason = self._files.reason()
+        self._on_end(f"{how}: {reason}" if reason else how, status < 0)
 
 
 class AgentLauncher:

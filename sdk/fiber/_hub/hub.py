@@ -57,11 +57,15 @@ _ACCEPT_AGAIN = 0.1
 class Hub:
     """Hub of a host.  Runs on the loop's thread, but for methods marked "any thread"."""
 
-    def __init__(self, loop: Loop, host: str, directory: str | None = None) -> None:
+    def __init__(
+        self, loop: Loop, host: str, parent: str | None = None, directory: str | None = None
+    ) -> None:
+        """``directory``: the one to make for the socket, else one with a new name in ``parent``."""
         self.host = host
         self.key = secrets.token_bytes(protocol.KEY_BYTES)
         self._loop = loop
-        self._parent = directory
+        self._parent = parent
+        self._directory = directory
         self._poller = Poller(loop)
         self.registry = Registry(self._host_object, loop.call_soon)
         self.doorbell = Doorbell(loop.call_soon)
@@ -183,7 +187,7 @@ class Hub:
 
     def _open_socket(self) -> None:
         try:
-            listener, path = _listen(self._parent)
+            listener, path = _listen(self._parent, self._directory)
         except TooManyOpenFiles:
             raise
         except OSError as error:
@@ -251,9 +255,14 @@ class Hub:
         return HostedCounter(self._poller, LocalCounter(fd))
 
 
-def _listen(parent: str | None) -> tuple[socket.socket, str]:
-    """A socket in a directory of its own in ``parent``, or in the system's place for such."""
-    directory = tempfile.mkdtemp(prefix="fiber-", dir=parent)
+def _listen(parent: str | None, directory: str | None) -> tuple[socket.socket, str]:
+    """Make a socket in a new directory: ``directory``, or one in ``parent`` or the system's place
+    for such.
+    """
+    if directory is None:
+        directory = tempfile.mkdtemp(prefix="fiber-", dir=parent)
+    else:
+        os.mkdir(directory, 0o700)
     path = os.path.join(directory, "hub")
     with contextlib.ExitStack() as undo:
         undo.callback(remove_directory, directory)

@@ -32,6 +32,8 @@ class MasterListener:
     * ``on_agent`` attaches an observer to the new link, or returns why the link is not wanted.
     * ``on_refused`` gets the line to log for a connection that was turned away.
     * ``on_proven`` is called for each connection that proved to be an agent of the pool.
+    * ``on_unserved`` gets the name of an agent for which this master lacks memory or descriptors,
+      and why.
     * ``objection`` returns why an agent with this name and uid is refused, or "".  None means that
       this is not known yet: the agent then waits some seconds for a call of ``look_again``.
 
@@ -48,6 +50,7 @@ class MasterListener:
         on_agent: Callable[[Link], str | None],
         on_refused: Callable[[str], None],
         on_proven: Callable[[], None] = lambda: None,
+        on_unserved: Callable[[str, str], None] = lambda name, reason: None,
         objection: Callable[[Identity], str | None] = lambda identity: "",
         keepalive: Keepalive = DEFAULT_KEEPALIVE,
         lost_grace: float | None = None,
@@ -55,6 +58,7 @@ class MasterListener:
         self._loop = loop
         self._on_agent = on_agent
         self._on_proven = on_proven
+        self._on_unserved = on_unserved
         self._knows = objection
         self.epoch = 0
         """Number of this master among those of the pool.  On the loop's thread."""
@@ -225,6 +229,8 @@ class MasterListener:
             )
         except FiberError as error:
             pending.report_proven(f"{hello.identity.name!r} cannot be served: {error}")
+            if new:
+                self._on_unserved(hello.identity.name, str(error))
             return
         self._links[hello.link] = link
         link.connected(connection, hello.arrived)

@@ -312,6 +312,11 @@ def _pair(
             raise
     except pynng.OutOfFiles as error:
         raise TooManyOpenFiles("making a link") from error
+    except pynng.NoMemory as error:
+        raise LinkError(
+            "no memory is left for a link. Raise the limit of this process (`ulimit -v` in the "
+            "shell that starts the program, or that of its container), or use fewer agents"
+        ) from error
     except pynng.NNGException as error:
         raise LinkError(f"nng does not take the connection: {str(error).lower()}") from error
     finally:
