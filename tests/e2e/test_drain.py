@@ -62,6 +62,7 @@ def test_tasks_that_do_not_end_in_time_run_elsewhere(
     program = start(programs, tasks=WORKERS, seconds=20, disruptions=1, template=template)
     began = tasks_under_way(scene, program)
     with drained(scene, node_of(scene, began[-1][1])) as pods:
+        scene.wait("the status counts the linked workers", lambda: connected(scene), 60)
         done = program.says("done", seconds=90)
     assert done["total"] == squares(WORKERS)
     assert not pods & set(done["hosts"])
@@ -91,6 +92,12 @@ def test_a_killed_test_leaves_no_node_cordoned(cluster: Cluster, kube: Kube) -> 
     assert nodes[0] not in cluster.workers()
     uncordon(kube)  # as the next session begins
     assert cluster.workers() == nodes
+
+
+def connected(scene: Scene) -> int:
+    """The workers that are linked to the program, as the status of its pool counts them."""
+    (pool,) = scene.now["fiberpools"].values()
+    return int(pool.get("status", {}).get("connectedReplicas") or 0)
 
 
 def is_ending(pod: Body, *, name: str) -> bool:

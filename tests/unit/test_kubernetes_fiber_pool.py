@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 from fakes.kubernetes_api import Call, Fault
+from fakes.rights import FiberUser
 from fakes.store import Failure
 from fiber._backends.kubernetes import fiber_pool, informer
 from fiber._backends.kubernetes.api_errors import Forbidden
@@ -130,14 +131,54 @@ def test_a_lease_that_was_there_before_is_not_taken_for_the_pools(rig: Rig, told
     assert told.error().reason == "AlreadyExists"
 
 
-def test_a_secret_that_may_not_be_read_is_taken_for_the_pools(rig: Rig, told: Told) -> None:
-    rig.server.api.faults += [
-        Fault("create", "secrets", carried_out=True),
-        Fault("get", "secrets", 403, reason="Forbidden"),
-    ]
+@pytest.mark.parametrize("there", [True, False], ids=["anothers", "own"])
+def test_a_secret_of_which_the_maker_is_unknown_is_not_used(
+    rig: Rig, told: Told, there: bool
+) -> None:
+    """An attempt has no answer, and fiber-user may not read whose Secret is there then."""
+    rig.server.api.allows = FiberUser(NAMESPACE).allow
+    name = names.secret_name("es-1")
+    if there:
+        other = {"metadata": {"name": name}, "data": {"key": "b3RoZXI="}}
+        rig.server.do(rig.server.store.create, "secrets", NAMESPACE, other)
+    rig.server.api.faults.append(Fault("create", "secrets", carried_out=not there))
     rig.own(told).demand(1)
     replicas_become(rig, told, 1)
     assert not told.errors
+    used = rig.spec()["credentialsSecretName"]
+    assert used != name
+    secret = rig.get("secrets", used)
+    assert set(secret["data"]) == {names.KEY_POOL, names.KEY_MASTER}
+    assert secret["metadata"]["ownerReferences"][0]["uid"] == rig.pool()["metadata"]["uid"]
+    left = {secret["metadata"]["name"] for secret in rig.server.objects("secrets")} - {used}
+    assert left == ({name} if there else set())
+
+
+def test_a_lease_that_came_before_an_attempt_without_an_answer_is_not_the_pools(
+    rig: Rig, told: Told
+) -> None:
+    """A neighbour may read in the pool which holder the Lease will have."""
+    rig.server.api.allows = FiberUser(NAMESPACE).allow
+    name = names.master_lease_name("es-1")
+    holder = {"holderIdentity": MASTER.identity, "acquireTime": "2026-01-01T00:00:00.000000Z"}
+    forged = {"metadata": {"name": name}, "spec": holder}
+    rig.server.do(rig.server.store.create, "leases", NAMESPACE, forged)
+    rig.server.api.faults.append(Fault("create", "leases"))
+    rig.own(told)
+    assert told.error().reason == "AlreadyExists"
+
+
+def test_another_pool_is_not_deleted_after_attempts_without_an_answer(rig: Rig, told: Told) -> None:
+    rig.server.api.allows = FiberUser(NAMESPACE).allow
+    other = {"metadata": {"name": "es-1"}, "spec": {"master": OTHER.spec("es-1", 1)}}
+    rig.server.do(rig.server.store.create, names.PLURAL, NAMESPACE, other)
+    tried = threading.Event()
+    on(rig, "create", names.PLURAL, tried.set)
+    rig.server.api.faults.append(Fault("create", names.PLURAL, carried_out=True, times=math.inf))
+    client = rig.own(told)
+    assert tried.wait(PATIENCE)
+    client.close()
+    assert rig.spec()["master"]["identity"] == OTHER.identity
 
 
 @pytest.mark.parametrize("plural", ["secrets", "leases"])
@@ -168,6 +209,7 @@ def test_in_a_pod_the_pool_is_owned_by_it(rig: Rig, told: Told) -> None:
 
 @pytest.mark.parametrize("plural", [names.PLURAL, "secrets", "leases"])
 def test_an_answer_that_is_lost_while_it_is_born(rig: Rig, told: Told, plural: str) -> None:
+    rig.server.api.allows = FiberUser(NAMESPACE).allow
     rig.server.api.faults.append(Fault("create", plural, carried_out=True))
     rig.own(told).demand(2)
     replicas_become(rig, told, 2)

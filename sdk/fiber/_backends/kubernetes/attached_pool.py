@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import contextlib
 import json
+import secrets
 import threading
 import time
 from collections.abc import Callable, Iterable
@@ -86,6 +87,8 @@ class AttachedPool:
         self._lease_path = LEASES.path(self.namespace, names.master_lease_name(self.name))
         self.connected: Callable[[], int] = lambda: 0
         """Agents that are linked to this program, as its Lease tells; called on any thread."""
+        self._acquired = ""
+        """Time in the Lease that this program made."""
         self.generation = int(metadata["generation"])
         """Generation of the spec that this program wrote last."""
 
@@ -187,7 +190,7 @@ class AttachedPool:
 
     def make_lease(self, **how: Any) -> None:
         """Conflict if there is one."""
-        now = _micro_time()
+        now = self._acquired = _micro_time()
         body = {
             "apiVersion": LEASES.api_version,
             "kind": LEASES.kind,
@@ -201,10 +204,14 @@ class AttachedPool:
         }
         self._api.create(LEASES.path(self.namespace), body, **how)
 
-    def has_lease(self, **how: Any) -> bool:
-        """Return whether the Lease that is there is this master's."""
+    def made_lease(self, **how: Any) -> bool:
+        """Return True if the Lease that is there is the one of ``make_lease``.
+
+        A neighbour may read the identity in the pool, but not foresee the time to a microsecond.
+        """
         spec = self._api.get(self._lease_path, **how).get("spec") or {}
-        return spec.get("holderIdentity") == self.master.identity
+        written = (self.master.identity, self._acquired)
+        return written == (spec.get("holderIdentity"), spec.get("acquireTime"))
 
     def free_lease(self, **how: Any) -> None:
         """Let whoever comes next find that nobody holds it."""
@@ -273,6 +280,8 @@ def pool_key_of(secret: Body) -> str:
     return identity.key_in(secret.get("data") or {})
 
 
+_NAME_BYTES = 8
+"""Random bytes in the name of a Secret that takes another's place."""
 _EPOCH = 1
 """Epoch of a program's own pool, which never has another master."""
 
@@ -301,6 +310,8 @@ class OwnPool:
         self._may_exist = False
         self.name = str(body["metadata"]["name"])
         self.namespace = namespace
+        self._path = POOLS.path(namespace, self.name)
+        self._secret = names.secret_name(self.name)
         self.doing = "make"
         self.displaced = ""
         self.remedy = f"kubectl delete fiberpool {self.name} -n {namespace}"
@@ -312,41 +323,58 @@ class OwnPool:
         It has its master from the first moment: whoever dies between two of these calls leaves a
         pool whose master's Lease is absent or gets old, and that the operator deletes.
         """
-        self._attached = AttachedPool(self._api, self._create(cancel), self._master, _EPOCH)
-        self._make_secret(self._attached, cancel)
+        attached = self._make_pool(cancel)
+        while not self._make_secret(attached, cancel):
+            # A FiberPool names one Secret for ever, so another FiberPool takes its place.  If the
+            # Secret is this program's after all, it goes with the first.
+            with contextlib.suppress(NotFound, Conflict):
+                self._api.delete(self._path, uid=attached.uid, cancel=cancel)
+            self._secret = f"{names.secret_name(self.name)}-{secrets.token_hex(_NAME_BYTES)}"
+            attached = self._make_pool(cancel)
         try:
-            self._attached.make_lease(cancel=cancel)
+            attached.make_lease(cancel=cancel)
         except Conflict as error:
-            if not (error.repeated and self._attached.has_lease(cancel=cancel)):
+            if not (error.repeated and attached.made_lease(cancel=cancel)):
                 raise
             # It was made by an attempt whose answer was lost.
-        return self._attached
+        return attached
 
     def detach(self, timeout: float) -> None:
         """Delete it, if it may be there."""
-        if self._attached is None and not self._may_exist:
-            return
-        uid = None if self._attached is None else self._attached.uid
         try:
-            self._api.delete(POOLS.path(self.namespace, self.name), uid=uid, timeout=timeout)
+            if self._attached is not None:
+                uid = self._attached.uid
+            elif self._may_exist:
+                found = self._api.get(self._path, timeout=timeout)
+                if not self._is_own(found):
+                    return
+                uid = str(found["metadata"]["uid"])
+            else:
+                return
+            self._api.delete(self._path, uid=uid, timeout=timeout)
         except (NotFound, Conflict):
             pass  # it is gone, or even its name is another's
 
-    def _make_secret(self, pool: AttachedPool, cancel: threading.Event) -> None:
-        name = names.secret_name(self.name)
-        secret = secret_body(name, self._credentials, pool.owner, pool.labels)
+    def _make_pool(self, cancel: threading.Event) -> AttachedPool:
+        self._attached = None
+        found = self._create(cancel)
+        self._attached = AttachedPool(self._api, found, self._master, _EPOCH)
+        return self._attached
+
+    def _make_secret(self, pool: AttachedPool, cancel: threading.Event) -> bool:
+        """Return False if a Secret is there of which it cannot be known who made it.
+
+        An earlier attempt had no answer then.  The role fiber-user reads no Secret, so this program
+        cannot compare.
+        """
+        secret = secret_body(self._secret, self._credentials, pool.owner, pool.labels)
         try:
             self._api.create(SECRETS.path(self.namespace), secret, cancel=cancel)
         except Conflict as error:
             if not error.repeated:
                 raise  # somebody else was faster
-            try:
-                found = self._api.get(SECRETS.path(self.namespace, name), cancel=cancel)
-            except Forbidden:
-                return  # fiber-user reads no Secret. With another's keys no agent could join
-            if found.get("data") != secret["data"]:
-                raise
-            # It was made by an attempt whose answer was lost.
+            return False
+        return True
 
     def _create(self, cancel: threading.Event) -> Body:
         metadata = dict(self._body["metadata"])
@@ -357,7 +385,7 @@ class OwnPool:
             "replicas": 0,
             "master": self._master.spec(self.name, _EPOCH),
             "onLost": "Delete",
-            "credentialsSecretName": names.secret_name(self.name),
+            "credentialsSecretName": self._secret,
         }
         body = {**self._body, "metadata": metadata, "spec": spec}
         try:
@@ -365,13 +393,18 @@ class OwnPool:
         except Conflict as error:
             if not error.repeated:
                 raise
-            found = self._api.get(POOLS.path(self.namespace, self.name), cancel=cancel)
-            if identity_in(found) != self._master.identity:
+            found = self._api.get(self._path, cancel=cancel)
+            if not self._is_own(found):
                 raise
             return found  # made by an attempt whose answer was lost
         except Transient:
             self._may_exist = True
             raise
+
+    def _is_own(self, found: Body) -> bool:
+        """Return True if the pool has what this program wrote, and no other program knew."""
+        written = (self._master.identity, self._secret)
+        return written == (identity_in(found), found["spec"].get("credentialsSecretName"))
 
 
 _PAUSE = 0.05

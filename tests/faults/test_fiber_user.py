@@ -1,4 +1,4 @@
-"""``backend="auto"`` on a played cluster, by an account that has the role ``fiber-user`` alone."""
+"""Programs on a played cluster whose account has the role ``fiber-user`` and no other right."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from fakes.cluster import FakeCluster, fake_cluster
+from fakes.kubernetes_api import Fault
 from fakes.rights import FiberUser
 from faults.runtime import running
 from fiber.pool import Pool
@@ -98,3 +99,11 @@ def test_an_account_without_rights_stays_local_in_silence(
     cluster.world.api.allows = lambda call: False
     assert backend() == "local"
     assert not caplog.messages
+
+
+def test_pods_come_though_the_secret_was_made_by_an_attempt_without_an_answer(
+    cluster: FakeCluster,
+) -> None:
+    cluster.do(cluster.world.api.faults.append, Fault("create", "secrets", carried_out=True))
+    assert backend() == "kubernetes"
+    cluster.wait(lambda: not cluster.world.store.list("secrets"))
