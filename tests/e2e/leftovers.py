@@ -8,8 +8,8 @@ from e2e.scene import Scene
 from fiber_api import names
 
 _OWN = ("fiberpools", "pods", "secrets", "leases", "services", "endpointslices")
-_NOT_THEIRS = {f"leases/{names.CRD_NAME}"}
-"""The operator's, by which it serves the namespace."""
+_NOT_THEIRS = {f"leases/{names.SERVING_LEASE}"}
+"""The Lease by which the operator shows that it serves the namespace."""
 
 
 def leaves_nothing(program: Program, seconds: float = 45.0) -> None:

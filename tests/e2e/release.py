@@ -161,8 +161,12 @@ class Release:
 
     def _may_everywhere(self, verb: str, resource: str) -> bool:
         resource, _, part = resource.partition("/")
-        if resource == "leases":  # of which it may change this one alone
-            resource = f"{resource}/{names.CRD_NAME}"
+        if (verb, resource) == ("patch", "leases"):  # of which it may patch this one alone
+            lease = f"leases/{names.SERVING_LEASE}"
+            return self.may(verb, lease, names.SERVING_NAMESPACE)
+        if (verb, resource) == ("update", "leases"):
+            lease = f"leases/{names.operator_lease_name(self.deployment)}"
+            return self.may(verb, lease, self.namespace)
         return self._may(verb, resource, "--subresource", part, "--all-namespaces")
 
     def page(self, name: str, pod: Body) -> str:

@@ -13,6 +13,7 @@ from e2e.pools import Pool
 from e2e.release import Release, crd_owner
 from e2e.scene import Scene
 from e2e.test_apply import EXAMPLES
+from fiber_api import names
 
 
 def restarts(pool: Pool) -> dict[str, tuple[str, int]]:
@@ -91,6 +92,8 @@ def test_one_namespace_is_enough(small: Release, pool: Pool, agent: Body, kube: 
     assert not kube.items(path_of("clusterroles"), **labels)
     assert not kube.items(path_of("clusterrolebindings"), **labels)
     assert kube.items(path_of("roles", small.namespace), **labels)
+    lease = path_of("leases", small.namespace, names.SERVING_LEASE)
+    pool.wait("it shows that it serves", lambda: kube.get(lease))
     pool.scale(2)
     pool.ready(2)
     small.helm("test", small.name, "--namespace", small.namespace)

@@ -28,11 +28,6 @@ Service may not: it takes no dot and begins with a letter.
 {{- printf "%s:%s" .Release.Namespace (include "fiber-operator.fullname" .) -}}
 {{- end -}}
 
-{{/* As the operator calls its release, in the Lease of each namespace that it serves. */}}
-{{- define "fiber-operator.releaseName" -}}
-{{- printf "%s/%s" .Release.Namespace (include "fiber-operator.fullname" .) -}}
-{{- end -}}
-
 {{/* As the operator calls the Lease of its release: no pool's Lease has a dot in its name. */}}
 {{- define "fiber-operator.leaseName" -}}
 {{- printf "%s.operator.fiber.dev" (include "fiber-operator.fullname" .) -}}
