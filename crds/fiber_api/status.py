@@ -68,7 +68,7 @@ class Problem(Model):
     """Sentences: what happened, why, and what to do."""
 
 
-class Condition(Model):
+class PoolCondition(Model):
     """Condition, as in every Kubernetes resource."""
 
     type: str
@@ -130,7 +130,7 @@ class FiberPoolStatus(Model):
     ] = ()
     """Problems, worst first, at most ten."""
     conditions: Annotated[
-        tuple[Condition, ...],
+        tuple[PoolCondition, ...],
         Field(
             strict=False,
             json_schema_extra={**LIST_AS_MAP, "x-kubernetes-list-map-keys": ["type"]},

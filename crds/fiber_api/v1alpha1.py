@@ -16,11 +16,10 @@ from pydantic import Field, PrivateAttr, ValidationError
 
 from fiber_api import names
 from fiber_api.model import Model, Rule, Time, describe
-from fiber_api.status import Condition, Failures, FiberPoolStatus, Problem
+from fiber_api.status import Failures, FiberPoolStatus, PoolCondition, Problem
 from fiber_api.template import Template, container_names
 
 __all__ = [
-    "Condition",
     "FailurePolicy",
     "Failures",
     "FiberPool",
@@ -28,8 +27,9 @@ __all__ = [
     "FiberPoolStatus",
     "Idle",
     "InvalidPool",
-    "Master",
+    "MasterSpec",
     "Metadata",
+    "PoolCondition",
     "Problem",
     "ScaleDown",
     "ScaleUp",
@@ -80,7 +80,7 @@ def _unchanged(field: str) -> str:
     )
 
 
-class Master(Model):
+class MasterSpec(Model):
     """Program that uses the pool. Written by the SDK when it attaches; absent in a warm pool that
     waits for one."""
 
@@ -269,7 +269,7 @@ class FiberPoolSpec(Model):
     worker_container: Annotated[str, Field(min_length=1, max_length=63)] = names.WORKER_CONTAINER
     """Name of the container that runs Fiber's agent and by which a worker is judged. Cannot be
     changed."""
-    master: Master | None = None
+    master: MasterSpec | None = None
     on_lost: Literal["Delete", "ScaleToMin", "Retain"] = "ScaleToMin"
     """Action when the master is lost: Delete deletes the pool with all its objects, ScaleToMin goes
     back to minReplicas, Retain changes nothing."""

@@ -2,12 +2,12 @@
 
 ::
 
-    handlers ─► turns ─► controller ─► planning.reconcile.plan ─► Plan
-    (kopf)     (queue)    │  ▲
-                          ▼  │
-                         cluster
-                   (the API's only door)
+    watches ──► workqueue ──► controller ──► planning.reconcile.plan ──► Plan
+    (kopf)                     │    ▲
+                               ▼    │
+                              cluster
+                      (client of the API server)
 
-What is decided is decided in ``planning``, which knows no clock, thread, socket, kopf or client;
-what is done is done through ``cluster``.
+``planning`` makes all decisions, without a clock, thread, socket, kopf or client.  ``cluster``
+makes all calls to the API server.
 """

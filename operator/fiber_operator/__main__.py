@@ -1,4 +1,4 @@
-"""``python -m fiber_operator``: run the operator until SIGTERM.  Settings: see ``settings``."""
+"""``python -m fiber_operator``: run the operator until SIGTERM.  ``settings`` has its settings."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import sys
 import prometheus_client
 
 from fiber_operator import logs
-from fiber_operator.program import Program
-from fiber_operator.settings import Settings, SettingsError
+from fiber_operator.process import OperatorProcess
+from fiber_operator.settings import OperatorSettings, SettingsError
 
 GARBAGE = 10_000
 """New objects after which garbage is looked for."""
@@ -25,18 +25,18 @@ such pool would make the list of all pools unreadable."""
 log = logging.getLogger("fiber_operator")
 
 
-async def _operate(settings: Settings) -> None:
+async def _operate(settings: OperatorSettings) -> None:
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
-    await Program(settings).run(stop)
+    await OperatorProcess(settings).run(stop)
 
 
 def main() -> int:
     """The process; the exit status is 0 after a signal, 2 if the settings make no sense."""
     try:
-        settings = Settings.from_environment(os.environ)
+        settings = OperatorSettings.from_environment(os.environ)
     except SettingsError as error:
         print(f"fiber_operator: {error}", file=sys.stderr)
         return 2

@@ -1,14 +1,17 @@
-"""The only door to the API server.  JSON documents go in and come out; nothing is cached.
+"""Client of the API server: JSON documents go in and come out; nothing is cached.
 
-A call that ends in ``Unavailable`` may have been carried out.  Nothing is tried again in here:
-whoever asks plans anew, which is safer than a repeated request that was right a minute ago.
+A call that ends in ``Unavailable`` may have been carried out.  The client never retries: the caller
+plans again, because a request that was right a minute ago may be wrong now.
 """
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import os
 import time
-from collections.abc import Awaitable, Callable, Mapping
+from collections import OrderedDict, deque
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from typing import Any, NamedTuple, TypeVar
 
 import aiohttp
@@ -18,34 +21,21 @@ from kubernetes.aio.client.configuration import Configuration
 from kubernetes.aio.client.rest import RESTClientObject, RESTResponse
 
 from fiber_api import names
-from fiber_operator.api_errors import (
-    ApiError,
+from fiber_operator.responses import (
+    METADATA_LIST,
+    PIECE,
     Body,
-    Conflict,
-    Gone,
-    Invalid,
-    Refused,
-    TooMany,
+    ListReader,
     Unavailable,
     document_of,
     object_of,
 )
-from fiber_operator.listing import METADATA_LIST, PIECE, Listing
-from fiber_operator.turns import Turns
 
 __all__ = [
-    "ApiError",
-    "Body",
     "Cluster",
     "Configuration",
-    "Conflict",
-    "Gone",
-    "Invalid",
     "Permit",
-    "Refused",
-    "Resource",
-    "TooMany",
-    "Unavailable",
+    "ResourceType",
     "load_configuration",
     "open_session",
 ]
@@ -68,7 +58,7 @@ _JSON = "application/json"
 _METADATA = f"{_JSON};as={METADATA_LIST};g=meta.k8s.io;v=v1"
 
 
-class Resource(NamedTuple):
+class ResourceType(NamedTuple):
     """A kind of object, as the API's paths name it."""
 
     group: str
@@ -82,14 +72,14 @@ class Resource(NamedTuple):
         return "/".join(part for part in (start, scope, self.plural, name, subresource) if part)
 
 
-POOLS = Resource(names.GROUP, names.VERSION, names.PLURAL)
-PODS = Resource("", "v1", "pods")
-SERVICES = Resource("", "v1", "services")
-SECRETS = Resource("", "v1", "secrets")
-EVENTS = Resource("", "v1", "events")
-SLICES = Resource("discovery.k8s.io", "v1", "endpointslices")
-BUDGETS = Resource("policy", "v1", "poddisruptionbudgets")
-LEASES = Resource("coordination.k8s.io", "v1", "leases")
+POOLS = ResourceType(names.GROUP, names.VERSION, names.PLURAL)
+PODS = ResourceType("", "v1", "pods")
+SERVICES = ResourceType("", "v1", "services")
+SECRETS = ResourceType("", "v1", "secrets")
+EVENTS = ResourceType("", "v1", "events")
+SLICES = ResourceType("discovery.k8s.io", "v1", "endpointslices")
+BUDGETS = ResourceType("policy", "v1", "poddisruptionbudgets")
+LEASES = ResourceType("coordination.k8s.io", "v1", "leases")
 
 
 async def _document(response: RESTResponse, what: str) -> Body:
@@ -118,7 +108,7 @@ class Cluster:
         configuration.client_session_kwargs = {"trust_env": False}
         self._client = ApiClient(configuration)
         self._client.user_agent = "fiber-operator"
-        self._turns = Turns(connections)
+        self._turns = NamespaceSemaphore(connections)
         self._permit = permit
         self._observe = observe
 
@@ -130,13 +120,13 @@ class Cluster:
         """Raise the error of ``permit`` if this process may change nothing now."""
         self._permit()
 
-    async def read(self, resource: Resource, namespace: str, name: str) -> Body:
+    async def read(self, resource: ResourceType, namespace: str, name: str) -> Body:
         """The object as it is now, not as a cache had it."""
         answer = await self._call("get", resource, namespace, name)
         return object_of(answer, name, f"get {resource.plural} {name}")
 
     async def list_metadata(
-        self, resource: Resource, namespace: str | None, keep: Callable[[Body], T]
+        self, resource: ResourceType, namespace: str | None, keep: Callable[[Body], T]
     ) -> list[T]:
         """Return what ``keep`` makes of each object's metadata, which come in pages."""
         try:
@@ -149,7 +139,7 @@ class Cluster:
 
     async def _pages(
         self,
-        resource: Resource,
+        resource: ResourceType,
         namespace: str | None,
         keep: Callable[[Body], T],
         query: dict[str, str],
@@ -160,7 +150,7 @@ class Cluster:
         async def read(response: RESTResponse, what: str) -> str:
             if not 200 <= response.status < 300:
                 await _document(response, what)  # raises what the status means
-            listing = Listing(response.response.content.iter_chunked(PIECE), what)
+            listing = ListReader(response.response.content.iter_chunked(PIECE), what)
             async for item in listing:
                 kept.append(keep(item))
             return listing.more()
@@ -175,7 +165,7 @@ class Cluster:
 
     async def list(
         self,
-        resource: Resource,
+        resource: ResourceType,
         namespace: str | None,
         keep: Callable[[Body], T],
         *,
@@ -192,7 +182,7 @@ class Cluster:
         return await self._pages(resource, namespace, keep, query, _JSON)
 
     async def create(
-        self, resource: Resource, namespace: str, body: Body, *, dry_run: bool = False
+        self, resource: ResourceType, namespace: str, body: Body, *, dry_run: bool = False
     ) -> Body:
         """Create the object; the answer is what it became.
 
@@ -203,13 +193,13 @@ class Cluster:
         answer = await self._call("create", resource, namespace, query=query, body=body)
         return object_of(answer, body["metadata"]["name"], f"create {resource.plural}")
 
-    async def replace(self, resource: Resource, namespace: str, name: str, body: Body) -> Body:
+    async def replace(self, resource: ResourceType, namespace: str, name: str, body: Body) -> Body:
         """Replace the object; Conflict if ``metadata.resourceVersion`` is not its current one."""
         answer = await self._call("update", resource, namespace, name, body=body)
         return object_of(answer, name, f"update {resource.plural} {name}")
 
     async def patch(
-        self, resource: Resource, namespace: str, name: str, patch: Body, subresource: str = ""
+        self, resource: ResourceType, namespace: str, name: str, patch: Body, subresource: str = ""
     ) -> Body:
         """A JSON merge patch: None removes a field, a list replaces the list."""
         answer = await self._call(
@@ -219,7 +209,7 @@ class Cluster:
 
     async def delete(
         self,
-        resource: Resource,
+        resource: ResourceType,
         namespace: str,
         name: str,
         *,
@@ -239,7 +229,7 @@ class Cluster:
     async def _call(
         self,
         verb: str,
-        resource: Resource,
+        resource: ResourceType,
         namespace: str | None,
         name: str = "",
         *,
@@ -333,3 +323,48 @@ async def open_session(configuration: Configuration, **options: Any) -> aiohttp.
         proxy=configuration.proxy,
         **options,
     )
+
+
+# -- Turns of namespaces
+
+
+class NamespaceSemaphore:
+    """``places`` that may be taken at the same time; each further one waits for its turn."""
+
+    def __init__(self, places: int) -> None:
+        self._free = places
+        self._waiting: OrderedDict[str, deque[asyncio.Future[None]]] = OrderedDict()
+        """Waiters by namespace, in the order of their turns."""
+
+    @contextlib.asynccontextmanager
+    async def take(self, namespace: str) -> AsyncIterator[None]:
+        """Hold a place."""
+        await self._acquire(namespace)
+        try:
+            yield
+        finally:
+            self._release()
+
+    async def _acquire(self, namespace: str) -> None:
+        if self._free:
+            self._free -= 1
+            return
+        turn = asyncio.get_running_loop().create_future()
+        self._waiting.setdefault(namespace, deque()).append(turn)
+        try:
+            await turn
+        except asyncio.CancelledError:
+            if turn.done() and not turn.cancelled():
+                self._release()  # the place was given just before
+            raise
+
+    def _release(self) -> None:
+        while self._waiting:
+            namespace, turns = self._waiting.popitem(last=False)
+            turn = turns.popleft()
+            if turns:
+                self._waiting[namespace] = turns
+            if not turn.done():
+                turn.set_result(None)
+                return
+        self._free += 1

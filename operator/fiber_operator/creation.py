@@ -1,7 +1,7 @@
-"""Creating pods: carefully at first, then many at a time, and never one twice.
+"""Creation of pods in batches of 1, 2, 4 and so on, each pod once.
 
-It goes on while the pool's pods are listed, planned for and told of.  A list that is read meanwhile
-may or may not have what is created meanwhile, so the creation itself says what to expect besides.
+Creation runs while the controller lists the pool's pods and plans.  A list may lack pods that were
+created meanwhile, so ``Creation.expect`` adds them: the expectations of other controllers.
 """
 
 from __future__ import annotations
@@ -12,18 +12,17 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from fiber_api import names
-from fiber_operator.cluster import (
-    PODS,
+from fiber_operator.cluster import PODS, Cluster
+from fiber_operator.planning.pods import PodView, observe
+from fiber_operator.responses import (
     ApiError,
     Body,
-    Cluster,
     Conflict,
     Invalid,
     Refused,
     TooMany,
     Unavailable,
 )
-from fiber_operator.planning.pods import PodView, observe
 from fiber_operator.workqueue import Key
 
 Draw = Callable[[], str]
@@ -35,7 +34,7 @@ def draw_suffix() -> str:
 
 
 @dataclass
-class Pace:
+class CreationPace:
     """Pace of creation of a pool so far, for its next batch."""
 
     batch: int = 1
@@ -77,7 +76,9 @@ class Creation:
     A batch in which anything fails is the last, and the next time begins with one pod.
     """
 
-    def __init__(self, cluster: Cluster, key: Key, pace: Pace, draw: Draw = draw_suffix) -> None:
+    def __init__(
+        self, cluster: Cluster, key: Key, pace: CreationPace, draw: Draw = draw_suffix
+    ) -> None:
         self._cluster = cluster
         self._key = key
         self._pace = pace

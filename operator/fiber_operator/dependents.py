@@ -1,10 +1,9 @@
-"""Dependents of a pool beside its pods: the Service, its EndpointSlice, the Secret, and a
-PodDisruptionBudget where the pool asks for one.
+"""Objects of a pool beside its pods: Service, EndpointSlice, Secret, and PodDisruptionBudget.
 
-They are looked at when the operator meets a pool, again every ``LOOK_AGAIN`` seconds, and for as
-long as something is wrong with them; between that, only a new master causes a call.  A Secret that
-``spec.credentialsSecretName`` names is its maker's: the operator looks only whether it is another
-pool's.
+They are checked when the operator first sees a pool, every ``CHECK_INTERVAL`` seconds, and in each
+reconcile while something is wrong with them.  Between the checks only a new master causes a call.
+A Secret that ``spec.credentialsSecretName`` names belongs to the user; the operator only makes
+sure that it is not another pool's.
 """
 
 from __future__ import annotations
@@ -17,27 +16,14 @@ from typing import Any
 
 from fiber_api import identity, names
 from fiber_api.names import Reason
-from fiber_api.v1alpha1 import FiberPool, Master
-from fiber_operator.cluster import (
-    BUDGETS,
-    SECRETS,
-    SERVICES,
-    SLICES,
-    ApiError,
-    Body,
-    Cluster,
-    Conflict,
-    Gone,
-    Invalid,
-    Refused,
-    Resource,
-    Unavailable,
-)
-from fiber_operator.planning import error_conditions, manifests
+from fiber_api.v1alpha1 import FiberPool, MasterSpec
+from fiber_operator.cluster import BUDGETS, SECRETS, SERVICES, SLICES, Cluster, ResourceType
+from fiber_operator.planning import manifests, messages
 from fiber_operator.planning.documents import items, mapping, seconds, text
 from fiber_operator.planning.plans import Obstacle
+from fiber_operator.responses import ApiError, Body, Conflict, Gone, Invalid, Refused, Unavailable
 
-LOOK_AGAIN = 50.0
+CHECK_INTERVAL = 50.0
 
 
 @dataclass(frozen=True)
@@ -47,7 +33,7 @@ class Dependents:
     address: str | None
     """``host:port`` of the Service."""
     obstacles: tuple[Obstacle, ...]
-    master: Master | None
+    master: MasterSpec | None
     """Master that the EndpointSlice leads to."""
     looked: float
     credentials: bool
@@ -96,7 +82,7 @@ class DependentsReconciler:
         steps: list[tuple[str, _Step]] = [
             (f"the EndpointSlice {names.endpoint_slice_name(name)}", self._slice)
         ]
-        fresh = known is not None and self._now() - known.looked < LOOK_AGAIN
+        fresh = known is not None and self._now() - known.looked < CHECK_INTERVAL
         complete = known is None or not fresh or bool(known.obstacles)
         if known is not None and not complete:
             if (known.master, known.budget) == (pool.spec.master, pool.spec.min_available):
@@ -138,7 +124,7 @@ class DependentsReconciler:
         except Conflict:
             raise
         except ApiError as error:
-            obstacle = error_conditions.with_object(error, what)
+            obstacle = messages.object_obstacle(error, what)
             return _Found(None, obstacle, error if isinstance(error, Unavailable) else None)
 
     async def _secret(self, pool: FiberPool) -> str | None:
@@ -245,7 +231,7 @@ class DependentsReconciler:
             await self._cluster.delete(BUDGETS, namespace, name, uid=uid)
 
     async def _have(
-        self, pool: FiberPool, resource: Resource, name: str, new: Callable[[], Body]
+        self, pool: FiberPool, resource: ResourceType, name: str, new: Callable[[], Body]
     ) -> Body:
         """The object of this name, made if there is none; obstructed if it is another's."""
         namespace = pool.metadata.namespace
@@ -308,7 +294,7 @@ def _has_ports(spec: Mapping[str, Any], ports: list[Body]) -> bool:
     return there == ports
 
 
-def _taken(pool: FiberPool, resource: Resource, name: str, existing: Body) -> Obstacle:
+def _taken(pool: FiberPool, resource: ResourceType, name: str, existing: Body) -> Obstacle:
     owners = [
         owner
         for owner in items(mapping(existing, "metadata").get("ownerReferences"))

@@ -1,18 +1,21 @@
-"""Health of the operator, for /healthz and /readyz.
+"""Health of the operator, and the HTTP server of /healthz, /readyz and /metrics.
 
-Not alive means that a restart may help: something in this process is stuck.  Not ready means that
-pools are not served as they should be, whoever is to blame; a restart would change nothing.
+"Not alive" means that this process is stuck and a restart may help.  "Not ready" means that pools
+are not served as they should be and a restart would change nothing.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass
 
-from fiber_operator.leader_election import LeaderElector
-from fiber_operator.resync import Resync
-from fiber_operator.watches import Watches
-from fiber_operator.workqueue import Queue
+from aiohttp import web
+
+from fiber_operator.metrics import CONTENT_TYPE, Metrics
+from fiber_operator.operator_leases import LeaderElector
+from fiber_operator.watches import Resync, WatchStatus
+from fiber_operator.workqueue import WorkQueue
 
 LATE_TURN = 30.0
 """Seconds that a pool may wait for its reconcile while the operator is ready."""
@@ -28,9 +31,9 @@ class Health:
     """Both checks.  Each returns what is wrong, a sentence each."""
 
     elector: LeaderElector
-    queue: Queue
+    queue: WorkQueue
     resync: Resync
-    watches: Watches
+    watches: WatchStatus
     clock: Callable[[], float]
 
     def __post_init__(self) -> None:
@@ -66,3 +69,40 @@ class Health:
         if statistics.longest_wait > LATE_TURN:
             wrong.append(f"a pool waits for its reconcile for {statistics.longest_wait:.0f} s")
         return wrong
+
+
+# -- The server
+
+Check = Callable[[], list[str]]
+"""Function that returns a sentence for each trouble; none: all is well."""
+
+
+@contextlib.asynccontextmanager
+async def serving(
+    host: str, port: int, *, alive: Check, ready: Check, metrics: Metrics
+) -> AsyncIterator[int]:
+    """Serve on ``host`` (empty: all addresses) and ``port`` (0: a free one, which is yielded)."""
+
+    async def show_metrics(request: web.Request) -> web.Response:
+        return web.Response(body=metrics.render(), headers={"Content-Type": CONTENT_TYPE})
+
+    application = web.Application()
+    application.router.add_get("/healthz", _handler(alive))
+    application.router.add_get("/readyz", _handler(ready))
+    application.router.add_get("/metrics", show_metrics)
+    runner = web.AppRunner(application, access_log=None, shutdown_timeout=0.5)
+    await runner.setup()
+    try:
+        await web.TCPSite(runner, host or None, port).start()
+        yield int(runner.addresses[0][1])
+    finally:
+        await runner.cleanup()
+
+
+def _handler(check: Check) -> Callable[[web.Request], Awaitable[web.Response]]:
+    async def answer(request: web.Request) -> web.Response:
+        wrong = check()
+        text = "\n".join(wrong) if wrong else "ok"
+        return web.Response(status=503 if wrong else 200, text=text + "\n")
+
+    return answer

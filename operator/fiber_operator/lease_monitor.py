@@ -1,29 +1,33 @@
-"""Monitor of the masters of pools, which judges by their Leases whether they live.
+"""Monitor of the masters' Leases, by which the operator knows whether masters live.
 
-A master is alive while its Lease changes.  One watch hears of all of them, by the label that they
-carry (``handlers.py``); a Lease is read only when its master is new and twice before the master is
-called lost, since a watch may be late or broken.  So a thousand masters that are well cost no
-requests.
+A master is alive while its Lease changes.  One watch (``watches.py``) reports the changes of all
+masters' Leases, selected by their label.  The monitor reads a Lease itself only when its master is
+new, and twice before it calls the master lost, since a watch may be late or broken.  So a thousand
+healthy masters cost no requests.
 
-Only this process's monotonic clock counts, and only time in which the Lease could be had: while
-the API server cannot be reached a master cannot renew its Lease either.
+Only this process's monotonic clock counts, and only time in which the Lease could be read: while
+the API server cannot be reached, a master cannot renew its Lease either.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
+from itertools import zip_longest
 from typing import NamedTuple
 
 from fiber_api.names import ANNOTATION_CONNECTED
-from fiber_operator.cluster import LEASES, ApiError, Cluster, Gone, Refused
+from fiber_operator.cluster import LEASES, Cluster
 from fiber_operator.logs import about
 from fiber_operator.planning.documents import mapping, text
 from fiber_operator.planning.plans import LeaseVerdict
-from fiber_operator.turns import in_turn
+from fiber_operator.responses import ApiError, Gone, Refused
 from fiber_operator.workqueue import Key
+
+log = logging.getLogger(__name__)
+
 
 CONFIRMED_AFTER = 1 / 3
 """Share of the duration in which an unchanged Lease must change before its master is lost.  The SDK
@@ -34,8 +38,6 @@ RECHECK = 60.0
 """Seconds after which the Lease of a lost master is read again."""
 AT_ONCE = 8
 """Leases that are read at the same time."""
-
-log = logging.getLogger(__name__)
 
 
 class MasterLease(NamedTuple):
@@ -189,3 +191,12 @@ def connected_in(lease: object) -> int | None:
     """Return how many agents the Lease says its master has, if it says so."""
     said = text(mapping(lease, "metadata", "annotations").get(ANNOTATION_CONNECTED))
     return int(said) if said.isascii() and said.isdigit() and len(said) < 10 else None
+
+
+def in_turn(keys: Iterable[Key]) -> list[Key]:
+    """Return ``keys`` with one of each namespace first, then a second of each, and so on."""
+    namespaces: dict[str, list[Key]] = {}
+    for key in keys:
+        namespaces.setdefault(key.namespace, []).append(key)
+    rounds = zip_longest(*namespaces.values())
+    return [key for found in rounds for key in found if key is not None]

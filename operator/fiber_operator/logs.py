@@ -1,7 +1,7 @@
 """Log lines: one JSON object a line for programs, or text for people.
 
-What a line is about comes with it as fields, not in the words: ``log.info("...", extra=about(key,
-uid=..., reason=...))`` gives ``namespace``, ``pool``, ``uid`` and ``reason``.
+The subject of a line is in its fields, not in its text: ``log.info("...", extra=about(*key,
+uid=..., reason=...))`` gives the fields ``namespace``, ``pool``, ``uid`` and ``reason``.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class JsonLines(logging.Formatter):
         return json.dumps(line, default=str)
 
 
-class Text(logging.Formatter):
+class TextLines(logging.Formatter):
     """The same for people: the fields after the message."""
 
     def __init__(self) -> None:
@@ -67,7 +67,7 @@ class Text(logging.Formatter):
 def set_up(level: str, style: str, stream: IO[str] | None = None) -> logging.Handler:
     """Send every log line of this process to ``stream`` (standard error if left out)."""
     handler = logging.StreamHandler(sys.stderr if stream is None else stream)
-    handler.setFormatter(JsonLines() if style == "json" else Text())
+    handler.setFormatter(JsonLines() if style == "json" else TextLines())
     root = logging.getLogger()
     root.handlers[:] = [handler]
     root.setLevel(level)

@@ -14,7 +14,7 @@ from prometheus_client.registry import Collector
 
 from fiber_operator.planning.documents import items, mapping, text, whole
 from fiber_operator.planning.pods import PodView
-from fiber_operator.workqueue import Key, Statistics
+from fiber_operator.workqueue import Key, QueueStatistics
 
 CONTENT_TYPE = CONTENT_TYPE_LATEST
 _SECONDS = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
@@ -86,7 +86,9 @@ class Metrics:
             f"fiber_operator_{name}_seconds", text, labels, buckets=_SECONDS, registry=self.registry
         )
 
-    def watch_queue(self, statistics: Callable[[], Statistics], held: Callable[[], bool]) -> None:
+    def watch_queue(
+        self, statistics: Callable[[], QueueStatistics], held: Callable[[], bool]
+    ) -> None:
         """Show the queue, and whether this operator acts, as they are when Prometheus asks."""
         gauges: dict[tuple[str, str], Callable[[], float]] = {
             ("pools", "Pools that the operator knows."): lambda: statistics().known,

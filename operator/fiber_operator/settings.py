@@ -1,7 +1,6 @@
-"""Settings from environment variables that begin with FIBER_OPERATOR_.
+"""Settings of the operator, from environment variables that begin with FIBER_OPERATOR_.
 
-A name that is not known is an error, since a setting that is misspelt and therefore ignored is
-found out too late.
+An unknown name is an error, because a misspelt setting would otherwise be ignored in silence.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ class SettingsError(ValueError):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Settings:
+class OperatorSettings:
     """Settings of this operator.  Times are in seconds."""
 
     namespaces: tuple[str, ...] = ()
@@ -77,7 +76,7 @@ class Settings:
     @classmethod
     def from_environment(
         cls, environment: Mapping[str, str], own_namespace: Path = _OWN_NAMESPACE
-    ) -> Settings:
+    ) -> OperatorSettings:
         """Read the settings.  Raises SettingsError that names all that is wrong at once."""
         given = {
             name.removeprefix(PREFIX): value.strip()

@@ -1,8 +1,9 @@
-"""``python -m fiber_operator.smoke MANIFEST``: does this cluster turn a FiberPool into workers?
+"""``python -m fiber_operator.smoke MANIFEST``: check that this cluster turns a FiberPool into pods.
 
-What ``helm test`` runs.  Makes the FiberPool of MANIFEST (a JSON document), waits until it is ready
-and deletes it, also when it is interrupted.  The pool's name belongs to the test: what an earlier
-one left under it is deleted first.  Exits with 0, or with 1 and a sentence that says what is wrong.
+``helm test`` runs this.  It creates the FiberPool of MANIFEST (a JSON document), waits until the
+pool is ready and deletes it, also when it is interrupted.  The pool's name belongs to the test: a
+pool of that name from an earlier test is deleted first.  The exit status is 0, or 1 with a message
+that says what is wrong.
 """
 
 from __future__ import annotations
@@ -15,15 +16,8 @@ from collections.abc import Callable, Coroutine, Mapping
 from typing import Any
 
 from fiber_api.names import CRD_NAME, ConditionType
-from fiber_operator.cluster import (
-    POOLS,
-    ApiError,
-    Cluster,
-    Conflict,
-    Gone,
-    Unavailable,
-    load_configuration,
-)
+from fiber_operator.cluster import POOLS, Cluster, load_configuration
+from fiber_operator.responses import ApiError, Conflict, Gone, Unavailable
 
 PATIENCE = 240.0
 """Seconds for the worker to become ready: less than `helm test` itself waits by default."""

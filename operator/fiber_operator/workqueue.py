@@ -1,26 +1,26 @@
-"""The queue between what happens and who reconciles it: each pool at most once in it.
+"""Work queue of pools: each pool waits in it at most once and is reconciled by one task at a time.
 
-However many events name a pool, it waits in the queue once and is worked on by one task at a time;
-what is added meanwhile makes one more reconcile afterwards.  Three things space those of one pool:
+Events that arrive during a reconcile cause one more reconcile afterwards.  Three rules space the
+reconciles of one pool:
 
-* after a reconcile it rests as long as the reconcile's result says, whatever happens;
+* after a reconcile the pool rests for as long as the reconcile's result says;
 * events of pods wait until ``GAP`` seconds after the last reconcile, so that a thousand events of a
-  pool that is growing are a few reconciles;
-* a reconcile that failed is repeated after a while that doubles each time.
+  growing pool cause a few reconciles;
+* a failed reconcile is repeated after a delay that doubles each time.
 
-While a pool changes it is also reconciled when the events of its pods cease, though it has not
-rested: what they led to is in the status at once, and not after a rest that began in the middle of
-it.  The next rest is longer by what this one lacked, and is not shortened.
+While a pool changes, it is also reconciled when the events of its pods cease, even if it has not
+rested: the status then shows the result at once.  The next rest is longer by the part that was
+skipped, and is not shortened again.
 
-Pools that are in trouble do not hold up the others.  A reconcile that lasts, since a
-webhook hangs for instance, hands its place on to the next after ``LONG`` seconds; pools whose last
-one failed let others go first and never take all places.
+A pool in trouble does not hold up others.  A reconcile that takes longer than ``LONG`` seconds, for
+example because a webhook hangs, passes its place to the next pool.  Pools whose last reconcile
+failed let others go first and never occupy all places.
 
-Namespaces take turns: the next pool is one of the namespace with the fewest reconciles under way.
-Among those it is the namespace whose last reconcile began first.  A namespace with none under way
-gets a place beside those that are taken, so that it does not wait for the others.
+Namespaces take turns: the next pool comes from the namespace with the fewest running reconciles,
+and among those from the one whose last reconcile began first.  A namespace without a running
+reconcile gets an extra place, so that it does not wait for others.
 
-Runs in one event loop and reads its clock; nothing here is called from another thread.
+The queue runs in one event loop and uses that loop's clock; it is not thread-safe.
 """
 
 from __future__ import annotations
@@ -35,6 +35,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from fiber_operator.logs import about
+
+log = logging.getLogger(__name__)
+
 
 GAP = 0.5
 """Seconds between reconciles that only pods' events asked for: they show in the status within a
@@ -52,8 +55,6 @@ YIELD = 10.0
 """Seconds by which a pool whose last reconcile failed lets others go first."""
 CROWD = 4
 """Reconciles under way at most, those that wait included, for each that may work."""
-
-log = logging.getLogger(__name__)
 
 
 _Heap = list[tuple[float, int, "Key"]]
@@ -108,7 +109,7 @@ class _Entry:
 
 
 @dataclass(frozen=True)
-class Statistics:
+class QueueStatistics:
     """The queue at one moment."""
 
     waiting: int
@@ -123,7 +124,7 @@ class Statistics:
     """Seconds since a reconcile ended, or since the queue was made."""
 
 
-class Queue:
+class WorkQueue:
     """Reconciles each pool in its time.  ``reconcile`` is awaited once at a time for a pool."""
 
     def __init__(self, reconcile: Callable[[Key], Awaitable[Result]], *, concurrency: int) -> None:
@@ -178,7 +179,7 @@ class Queue:
         if self._tasks:
             await asyncio.wait(self._tasks, timeout=grace)
 
-    def statistics(self) -> Statistics:
+    def statistics(self) -> QueueStatistics:
         """The queue now."""
         now = self._now()
         overdue = [
@@ -189,7 +190,7 @@ class Queue:
         runs = [
             now - entry.running for entry in self._entries.values() if entry.running is not None
         ]
-        return Statistics(
+        return QueueStatistics(
             waiting=len(overdue),
             running=len(runs),
             known=len(self._entries),

@@ -18,9 +18,9 @@ from fakes.kubernetes_api import Call
 from fakes.store import KINDS
 from fakes.world import NAMESPACE, World, a_world, configuration
 from fiber_api.names import SERVING_LEASE, SERVING_NAMESPACE
-from fiber_operator import handlers
+from fiber_operator import watches
 from fiber_operator.cluster import Configuration
-from fiber_operator.event_recorder import PAUSE
+from fiber_operator.events import PAUSE
 
 Right = tuple[str, str, str]
 MASTER = {
@@ -66,7 +66,7 @@ async def watch(world: World, stop: asyncio.Event) -> None:
 
     async def gate() -> None: ...
 
-    await handlers.watch(
+    await watches.watch(
         lambda *notice: None, configure=configure, namespaces=(), gate=gate, stop=stop
     )
 

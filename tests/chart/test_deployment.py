@@ -12,7 +12,7 @@ import fiber
 from chart.helm import Helm, Manifest, is_hook, named
 from chart.test_scope import environment
 from fiber_api.names import check_pool_name
-from fiber_operator.settings import Settings
+from fiber_operator.settings import OperatorSettings
 
 DNS_LABEL = "[a-z]([-a-z0-9]{0,61}[a-z0-9])?"
 """What a Service may be called."""
@@ -65,7 +65,7 @@ def test_every_pod_passes_the_restricted_standard(helm: Helm) -> None:
 def test_probes_ask_the_port_where_the_operator_listens(helm: Helm) -> None:
     manifests = helm.render({"metrics": {"port": 9000}})
     (container,) = pod_spec(manifests)["containers"]
-    assert Settings.from_environment(environment(manifests)).port == 9000
+    assert OperatorSettings.from_environment(environment(manifests)).port == 9000
     assert container["ports"] == [{"name": "metrics", "containerPort": 9000, "protocol": "TCP"}]
     probes = ("startup", "liveness", "readiness")
     paths = {probe: container[f"{probe}Probe"]["httpGet"] for probe in probes}
@@ -79,8 +79,8 @@ def test_probes_ask_the_port_where_the_operator_listens(helm: Helm) -> None:
 
 def test_the_chart_says_no_other_settings_than_the_operator_would_choose(helm: Helm) -> None:
     """The defaults of the two are written down in two places, and agree."""
-    chosen = Settings.from_environment(environment(helm.render()))
-    own = Settings()
+    chosen = OperatorSettings.from_environment(environment(helm.render()))
+    own = OperatorSettings()
     for name in (
         "namespaces",
         "host",
@@ -107,7 +107,7 @@ def test_every_setting_arrives(helm: Helm) -> None:
     }
     workers = {"defaultRequests": {"cpu": 0.1, "memory": ""}}
     rendered = helm.render({"operator": values, "workers": workers})
-    settings = Settings.from_environment(environment(rendered))
+    settings = OperatorSettings.from_environment(environment(rendered))
     assert settings.requests == {"cpu": "0.1"}
     assert (settings.log_level, settings.log_format) == ("DEBUG", "text")
     assert (settings.resync_seconds, settings.lease_seconds) == (30, 20)
@@ -204,7 +204,7 @@ def test_names_fit(helm: Helm, release: str, expected: str) -> None:
     assert re.fullmatch(DNS_LABEL, str(named(manifests, "Service")["metadata"]["name"]))
     pool = json.loads(named(manifests, "Pod")["spec"]["containers"][0]["args"][0])
     assert check_pool_name(pool["metadata"]["name"])
-    assert Settings.from_environment(environment(manifests)).lease == expected
+    assert OperatorSettings.from_environment(environment(manifests)).lease == expected
 
 
 def test_a_name_of_ones_own(helm: Helm) -> None:

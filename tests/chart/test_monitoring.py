@@ -14,7 +14,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from chart.helm import CHART, NAMESPACE, Helm, Manifest, kinds, named
 from fiber_operator.metrics import Metrics, PoolSample
-from fiber_operator.workqueue import Key, Statistics
+from fiber_operator.workqueue import Key, QueueStatistics
 
 ON: dict[str, Any] = {
     "metrics": {
@@ -31,7 +31,7 @@ TARGET_LABELS = {"namespace", "job", "instance", "le"}
 def exported() -> dict[str, set[str]]:
     """Each series that an operator exports, with its labels."""
     metrics = Metrics()
-    empty = Statistics(**{field.name: 0 for field in dataclasses.fields(Statistics)})
+    empty = QueueStatistics(**{field.name: 0 for field in dataclasses.fields(QueueStatistics)})
     metrics.watch_queue(lambda: empty, lambda: True)
     metrics.pools[Key("ns", "a")] = PoolSample(1, {"ready": 1}, {"Unschedulable": 1}, 1, 1)
     metrics.reconciled("ok", 0.1)

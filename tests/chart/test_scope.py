@@ -8,7 +8,7 @@ import pytest
 
 from chart.helm import NAMESPACE, Helm, Manifest, allowed, is_hook, kinds, named
 from fiber_api.names import SERVING_LEASE, operator_lease_name
-from fiber_operator.settings import Settings
+from fiber_operator.settings import OperatorSettings
 
 CLUSTER: dict[str, Any] = {"scope": "cluster"}
 OWN: dict[str, Any] = {"scope": "namespaced"}
@@ -26,7 +26,7 @@ def environment(manifests: list[Manifest]) -> dict[str, str]:
 
 def watched(manifests: list[Manifest]) -> tuple[str, ...]:
     """The namespaces that the operator will watch, as it reads its settings."""
-    return Settings.from_environment(environment(manifests)).namespaces
+    return OperatorSettings.from_environment(environment(manifests)).namespaces
 
 
 def granted(manifests: list[Manifest], account: str = "fiber-fiber-operator") -> dict[str, Any]:
@@ -124,7 +124,7 @@ def test_namespaced_makes_nothing_of_the_cluster_but_the_resource_type(helm: Hel
 @pytest.mark.parametrize("values", [CLUSTER, OWN, TWO], ids=["cluster", "own", "two"])
 def test_the_lease_is_the_operators_own(helm: Helm, values: dict[str, Any]) -> None:
     manifests = helm.render(values)
-    settings = Settings.from_environment(environment(manifests))
+    settings = OperatorSettings.from_environment(environment(manifests))
     role = named(manifests, "Role", "fiber-fiber-operator-lease")
     assert role["metadata"]["namespace"] == NAMESPACE
     leases = {rule["resources"][0] for rule in role["rules"]}

@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 
 from fiber_operator import smoke
-from fiber_operator.cluster import Cluster, Conflict, Gone, Invalid, Resource, Unavailable
+from fiber_operator.cluster import Cluster, ResourceType
+from fiber_operator.responses import Conflict, Gone, Invalid, Unavailable
 
 MANIFEST: dict[str, Any] = {
     "metadata": {"namespace": "ns", "name": "smoke-x"},
@@ -47,7 +48,7 @@ class Pools(Cluster):
         if self.faults.get(verb):
             raise self.faults[verb].pop(0)
 
-    async def read(self, resource: Resource, namespace: str, name: str) -> dict[str, Any]:
+    async def read(self, resource: ResourceType, namespace: str, name: str) -> dict[str, Any]:
         self._called("get")
         assert (resource.plural, namespace, name) == ("fiberpools", "ns", "smoke-x")
         if self.pool is None:
@@ -57,7 +58,7 @@ class Pools(Cluster):
         return {**self.pool, "status": self.statuses[0]} if self.statuses else self.pool
 
     async def create(
-        self, resource: Resource, namespace: str, body: dict[str, Any], *, dry_run: bool = False
+        self, resource: ResourceType, namespace: str, body: dict[str, Any], *, dry_run: bool = False
     ) -> dict[str, Any]:
         self._called("create")
         if self.pool is not None:
@@ -67,7 +68,7 @@ class Pools(Cluster):
 
     async def delete(
         self,
-        resource: Resource,
+        resource: ResourceType,
         namespace: str,
         name: str,
         *,

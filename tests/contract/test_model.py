@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from contract.bad_manifests import GOOD, MASTER, changed, keys_of
 from fiber_api.schema import schema
-from fiber_api.v1alpha1 import FiberPool, FiberPoolStatus, InvalidPool, Master
+from fiber_api.v1alpha1 import FiberPool, FiberPoolStatus, InvalidPool, MasterSpec
 
 GARBAGE: tuple[Any, ...] = (
     None,
@@ -219,7 +219,7 @@ def test_defaults_are_the_contracts() -> None:
     assert (policy.backoff_base_seconds, policy.backoff_max_seconds) == (5, 300)
     assert (policy.backoff_limit, policy.startup_timeout_seconds) == (6, 900)
     assert spec.update.strategy == "OnIdle"
-    master = Master.model_validate(MASTER)
+    master = MasterSpec.model_validate(MASTER)
     assert (master.lease_name, master.lease_duration_seconds) == (None, 30)
     assert master.lost_grace_seconds == 60
     assert (spec.on_lost, spec.idle, spec.credentials_secret_name) == ("ScaleToMin", None, None)

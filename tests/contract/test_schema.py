@@ -17,7 +17,7 @@ from fiber_api.v1alpha1 import (
     FailurePolicy,
     FiberPoolSpec,
     Idle,
-    Master,
+    MasterSpec,
     ScaleDown,
     ScaleUp,
     Update,
@@ -60,7 +60,7 @@ def nodes(node: dict[str, Any], path: str = "") -> Iterator[tuple[str, dict[str,
 NODES = dict(nodes(schema()))
 MODELS: dict[str, type[Model]] = {
     ".spec": FiberPoolSpec,
-    ".spec.master": Master,
+    ".spec.master": MasterSpec,
     ".spec.idle": Idle,
     ".spec.scaleDown": ScaleDown,
     ".spec.scaleUp": ScaleUp,

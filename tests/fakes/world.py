@@ -22,12 +22,12 @@ from fakes.store import Body, Failure, Store
 from fiber_api import names
 from fiber_operator.cluster import Configuration
 from fiber_operator.lease_monitor import connected_in
-from fiber_operator.program import Program
-from fiber_operator.settings import Settings
+from fiber_operator.process import OperatorProcess
+from fiber_operator.settings import OperatorSettings
 from fiber_operator.workqueue import Key
 
 NAMESPACE = "team"
-OWN_LEASE = names.operator_lease_name(Settings.lease)
+OWN_LEASE = names.operator_lease_name(OperatorSettings.lease)
 POLL = 0.5
 TEMPLATE = {"spec": {"containers": [{"name": "worker", "image": "registry/worker:1"}]}}
 
@@ -112,7 +112,7 @@ class World:
         self.kubelet = Kubelet(self.store)
         self.deaf = False
         """No event reaches the operator."""
-        self.program: Program
+        self.program: OperatorProcess
         self._task: asyncio.Task[None] | None = None
         self._nodes: asyncio.Task[None] | None = None
         self._stop = asyncio.Event()
@@ -132,12 +132,12 @@ class World:
         self.program = self.another(**{**defaults, **settings})
         self._task = asyncio.ensure_future(self.program.run(self._stop))
 
-    def another(self, **settings: Any) -> Program:
+    def another(self, **settings: Any) -> OperatorProcess:
         async def configure() -> Configuration:
             return _InMemory(self.connector)
 
-        return Program(
-            Settings(**settings),
+        return OperatorProcess(
+            OperatorSettings(**settings),
             configure=configure,
             watches=functools.partial(Feed, self),
             now=self.store.unix_now,

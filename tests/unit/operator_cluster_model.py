@@ -8,17 +8,17 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from fiber_api.v1alpha1 import FiberPool
-from fiber_operator.planning.plans import Memory, Plan
-from fiber_operator.planning.pods import PodView, State, Trouble
+from fiber_operator.planning.manifests import template_hash
+from fiber_operator.planning.plans import Knowledge, Plan
+from fiber_operator.planning.pods import PodState, PodView, Trouble
 from fiber_operator.planning.reconcile import plan
-from fiber_operator.planning.revisions import template_hash
 from unit.operator_objects import ADDRESS, NOW, UID, name_of, pool_document
 
 STARTING_TAKES = 2.0
 ENDING_TAKES = 3.0
 
 
-def view(number: int, state: State, **fields: Any) -> PodView:
+def view(number: int, state: PodState, **fields: Any) -> PodView:
     """A pod of the pool in some state."""
     known: dict[str, Any] = {
         "name": name_of(number),
@@ -29,7 +29,7 @@ def view(number: int, state: State, **fields: Any) -> PodView:
         "template_hash": "",
         "state": state,
         "since": NOW - 50,
-        "was_ready": state in (State.READY, State.NOT_READY),
+        "was_ready": state in (PodState.READY, PodState.NOT_READY),
         "scheduled": True,
     }
     return PodView(**{**known, **fields})
@@ -41,7 +41,7 @@ class Model:
 
     document: dict[str, Any] = field(default_factory=pool_document)
     pods: dict[str, PodView] = field(default_factory=dict)
-    memory: Memory = field(default_factory=lambda: Memory(address=ADDRESS))
+    knowledge: Knowledge = field(default_factory=lambda: Knowledge(address=ADDRESS))
     now: float = NOW
     fails: bool = False
     """New workers fail instead of getting Ready."""
@@ -59,7 +59,7 @@ class Model:
         return [pod for pod in self.pods.values() if pod.live]
 
     def plan(self) -> Plan:
-        return plan(self.pool, list(self.pods.values()), self.memory, self.now)
+        return plan(self.pool, list(self.pods.values()), self.knowledge, self.now)
 
     def write_status(self, made: Plan) -> None:
         if made.status is not None:
@@ -70,19 +70,19 @@ class Model:
             pod = self.pods[deletion.name]
             assert deletion.uid == pod.uid
             assert deletion.resource_version in (None, pod.resource_version)
-            if pod.state is State.ENDED:
+            if pod.state is PodState.ENDED:
                 del self.pods[pod.name]
             else:
-                ending = replace(pod, state=State.TERMINATING, since=self.now)
+                ending = replace(pod, state=PodState.TERMINATING, since=self.now)
                 self.pods[pod.name] = ending
 
     def create(self, made: Plan) -> None:
         if made.dry_run:
-            self.memory = replace(self.memory, accepted=made.template_hash)
+            self.knowledge = replace(self.knowledge, accepted=made.template_hash)
         for number in itertools.islice(self.numbers, made.create):
             pod = view(
                 number,
-                State.PENDING,
+                PodState.PENDING,
                 created=float(int(self.now)),
                 since=self.now,
                 template_hash=made.template_hash,
@@ -100,17 +100,17 @@ class Model:
 
     def restart(self) -> None:
         """The operator loses what it remembers."""
-        self.memory = Memory(address=ADDRESS)
+        self.knowledge = Knowledge(address=ADDRESS)
 
     def evict(self, number: int) -> bool:
         """End one of the workers that are Ready, if there is any."""
-        ready = [pod for pod in self.live if pod.state is State.READY]
+        ready = [pod for pod in self.live if pod.state is PodState.READY]
         if not ready:
             return False
         pod = ready[number % len(ready)]
         self.pods[pod.name] = replace(
             pod,
-            state=State.ENDED,
+            state=PodState.ENDED,
             since=self.now,
             trouble=Trouble.DISRUPTED,
             reason="Evicted",
@@ -121,10 +121,10 @@ class Model:
         """The kubelets go on."""
         self.now += seconds
         for pod in list(self.pods.values()):
-            if pod.state is State.TERMINATING and self.now - pod.since >= ENDING_TAKES:
+            if pod.state is PodState.TERMINATING and self.now - pod.since >= ENDING_TAKES:
                 del self.pods[pod.name]
-            elif pod.state is State.NOT_READY:
-                self.pods[pod.name] = replace(pod, state=State.READY, since=self.now)
+            elif pod.state is PodState.NOT_READY:
+                self.pods[pod.name] = replace(pod, state=PodState.READY, since=self.now)
             elif pod.live and not pod.was_ready and self.now - pod.created >= STARTING_TAKES:
                 self.pods[pod.name] = self._started(pod)
 
@@ -132,7 +132,7 @@ class Model:
         if self.fails:
             return replace(
                 pod,
-                state=State.ENDED,
+                state=PodState.ENDED,
                 since=self.now,
                 trouble=Trouble.APPLICATION,
                 reason="Error",
@@ -142,14 +142,14 @@ class Model:
         if self.completes:
             return replace(
                 pod,
-                state=State.ENDED,
+                state=PodState.ENDED,
                 since=self.now,
                 trouble=Trouble.COMPLETED,
                 reason="Completed",
                 exit_code=0,
                 ran=12.0,
             )
-        return replace(pod, state=State.READY, since=self.now, was_ready=True, trouble=None)
+        return replace(pod, state=PodState.READY, since=self.now, was_ready=True, trouble=None)
 
     def release_what_the_operator_may_not_take(self) -> None:
         """What the SDK does with idle workers: outdated ones and those that are too many."""

@@ -9,10 +9,10 @@ from typing import Any
 from fiber_api.names import LABEL_TEMPLATE_HASH
 from fiber_api.times import format_time
 from fiber_api.v1alpha1 import FiberPool, FiberPoolStatus
-from fiber_operator.planning.plans import Memory, Plan
+from fiber_operator.planning.manifests import template_hash
+from fiber_operator.planning.plans import Knowledge, Plan
 from fiber_operator.planning.pods import PodView, observe
 from fiber_operator.planning.reconcile import plan
-from fiber_operator.planning.revisions import template_hash
 
 NOW = 1_800_000_000.0
 UID = "11111111-2222-3333-4444-555555555555"
@@ -46,10 +46,10 @@ def with_plan(pool: FiberPool, plan: Plan) -> FiberPool:
     return FiberPool.read({**pool.model_dump(mode="json", by_alias=True), "status": plan.status})
 
 
-def memory_of(pool: FiberPool, **fields: Any) -> Memory:
+def knowledge_of(pool: FiberPool, **fields: Any) -> Knowledge:
     """An operator that has made the pool's Service and knows that its template is accepted."""
     known = {"address": ADDRESS, "credentials": True, "accepted": template_hash(pool)}
-    return Memory(**{**known, **fields})
+    return Knowledge(**{**known, **fields})
 
 
 def name_of(number: int) -> str:
@@ -168,9 +168,9 @@ def views(pool: FiberPool, *documents: Json) -> list[PodView]:
     ]
 
 
-def plan_of(pool: FiberPool, *pods: Json, now: float = NOW, **memory: Any) -> Plan:
+def plan_of(pool: FiberPool, *pods: Json, now: float = NOW, **knowledge: Any) -> Plan:
     """What is planned for the pool with these pods; further arguments are the operator's memory."""
-    return plan(pool, views(pool, *pods), memory_of(pool, **memory), now)
+    return plan(pool, views(pool, *pods), knowledge_of(pool, **knowledge), now)
 
 
 def status_of(pool: FiberPool, *pods: Json, **more: Any) -> FiberPoolStatus:

@@ -14,13 +14,14 @@ from fakes import virtual_time
 from fakes.kubernetes_api import Fault, KubernetesApi
 from fakes.store import Body, Store
 from fakes.world import configuration
-from fiber_operator import event_recorder
-from fiber_operator.cluster import Cluster, Conflict, Permit, TooMany, Unavailable
-from fiber_operator.creation import Created, Creation, Order, Pace, draw_suffix
-from fiber_operator.event_recorder import EventRecorder
-from fiber_operator.leader_election import NotLeader
-from fiber_operator.planning.plans import Event
+from fiber_operator import events
+from fiber_operator.cluster import Cluster, Permit
+from fiber_operator.creation import Created, Creation, CreationPace, Order, draw_suffix
+from fiber_operator.events import EventRecorder
+from fiber_operator.operator_leases import NotLeader
+from fiber_operator.planning.plans import PoolEvent
 from fiber_operator.planning.pods import PodView, observe
+from fiber_operator.responses import Conflict, TooMany, Unavailable
 from fiber_operator.workqueue import Key
 
 ES = Key("team", "es")
@@ -56,8 +57,8 @@ def order(limit: int = 100) -> Order:
     return Order("hash", body, "worker", limit)
 
 
-async def create(door: Cluster, count: int, pace: Pace | None = None) -> Created:
-    creation = Creation(door, ES, pace or Pace())
+async def create(door: Cluster, count: int, pace: CreationPace | None = None) -> Created:
+    creation = Creation(door, ES, pace or CreationPace())
     creation.aim(count, order())
     await creation.wait()
     return creation.take()
@@ -79,11 +80,11 @@ def test_names_are_drawn_at_random() -> None:
 
 @played
 async def test_all_are_created(api: KubernetesApi, door: Cluster) -> None:
-    pace = Pace()
+    pace = CreationPace()
     done = await create(door, 100, pace)
     assert sorted(done.names) == [pod["metadata"]["name"] for pod in api.store.list("pods")]
     assert len(done.names) == 100
-    assert pace == Pace(batch=1)
+    assert pace == CreationPace(batch=1)
 
 
 @pytest.mark.parametrize(("status", "kind"), [(403, "refusal"), (422, "refusal"), (404, "failure")])
@@ -91,12 +92,12 @@ def test_a_refusal_is_the_end(status: int, kind: str) -> None:
     @played
     async def test(api: KubernetesApi, door: Cluster) -> None:
         api.faults.append(Fault("create", "pods", status=status, skip=5, times=100))
-        pace = Pace()
+        pace = CreationPace()
         done = await create(door, 100, pace)
         assert len(api.calls) == 1 + 2 + 4
         assert len(done.names) == 5
         assert getattr(done, kind).status == status
-        assert pace == Pace(batch=1)
+        assert pace == CreationPace(batch=1)
 
     test()
 
@@ -107,7 +108,7 @@ async def test_a_quota_that_is_counted_at_the_same_time_is_no_refusal(
 ) -> None:
     message = "Operation cannot be fulfilled on resourcequotas: the object has been modified"
     api.faults.append(Fault("create", "pods", status=409, reason="Conflict", message=message))
-    pace = Pace()
+    pace = CreationPace()
     done = await create(door, 3, pace)
     assert isinstance(done.failure, Conflict)
     assert done.names == []
@@ -119,7 +120,7 @@ async def test_names_whose_fate_is_unknown_are_used_first(
     api: KubernetesApi, door: Cluster
 ) -> None:
     api.faults += [Fault("create", "pods", carried_out=True), Fault("create", "pods")]
-    pace = Pace(batch=2)
+    pace = CreationPace(batch=2)
     done = await create(door, 4, pace)
     assert isinstance(done.failure, Unavailable)
     unsure = list(pace.unsure)
@@ -136,7 +137,7 @@ async def test_the_longest_wait_that_was_asked_for_counts(
     api: KubernetesApi, door: Cluster
 ) -> None:
     api.faults += [Fault("create", "pods", status=429, retry_after=n) for n in (3, 20, 5)]
-    done = await create(door, 10, Pace(batch=4))
+    done = await create(door, 10, CreationPace(batch=4))
     assert isinstance(done.failure, TooMany)
     assert done.wait == 20.0
     assert len(done.names) == 1
@@ -147,7 +148,7 @@ async def test_a_creation_that_is_stopped_ends_with_its_batch(
     api: KubernetesApi, door: Cluster
 ) -> None:
     api.faults.append(Fault("create", "pods", late=0.4, times=10**6))
-    creation = Creation(door, ES, Pace())
+    creation = Creation(door, ES, CreationPace())
     creation.aim(100, order(limit=16))
     assert not await creation.wait(1.0)
     assert len(creation.take().names) == 1 + 2
@@ -170,7 +171,7 @@ async def test_what_a_list_cannot_show_is_expected_and_nothing_is_made_twice(
     for asked, answered in itertools.product([0.0, 0.3, 0.5, 1.3], [0.0, 0.2, 0.7, 1.5]):
         for pod in api.store.list("pods"):
             api.store.remove("pods", "team", pod["metadata"]["name"])
-        creation = Creation(door, ES, Pace())
+        creation = Creation(door, ES, CreationPace())
         creation.aim(10, order(limit=4))
         for _ in range(3):
             await asyncio.sleep(asked)
@@ -187,7 +188,7 @@ async def test_what_a_list_cannot_show_is_expected_and_nothing_is_made_twice(
 async def test_what_was_created_and_is_not_in_a_later_list_is_gone(
     api: KubernetesApi, door: Cluster
 ) -> None:
-    creation = Creation(door, ES, Pace())
+    creation = Creation(door, ES, CreationPace())
     before = asyncio.get_running_loop().time()
     creation.aim(2, order())
     await asyncio.sleep(1)
@@ -204,7 +205,7 @@ async def test_a_creation_that_is_cancelled_is_unsure_of_what_is_under_way(
     api: KubernetesApi, door: Cluster
 ) -> None:
     api.faults.append(Fault("create", "pods", late=0.4, times=10**6, skip=1))
-    pace = Pace()
+    pace = CreationPace()
     creation = Creation(door, ES, pace)
     creation.aim(10, order())
     await asyncio.sleep(0.2)
@@ -239,15 +240,15 @@ def recorder(api: KubernetesApi, door: Cluster) -> EventRecorder:
 
 @played
 async def test_an_event_that_repeats_is_counted(api: KubernetesApi, door: Cluster) -> None:
-    record, event = recorder(api, door), Event("Warning", "Because", "words")
+    record, event = recorder(api, door), PoolEvent("Warning", "Because", "words")
     for _ in range(100):
         await record.record(ES, "uid", event)
         await asyncio.sleep(1)
     (found,) = api.store.list("events")
     assert 60 < found["count"] <= 100
-    assert len(api.calls) <= 1 + 100 / event_recorder.PAUSE
+    assert len(api.calls) <= 1 + 100 / events.PAUSE
     assert found["lastTimestamp"] > found["firstTimestamp"]
-    await asyncio.sleep(event_recorder.WINDOW)
+    await asyncio.sleep(events.WINDOW)
     await record.record(ES, "uid", event)
     assert len(api.store.list("events")) == 2
 
@@ -260,15 +261,15 @@ async def test_events_are_posted_in_order_and_nobody_waits(
     running = asyncio.ensure_future(record.run())
     slow = Fault("create", "events", late=4.5, times=10**6)
     api.faults.append(slow)
-    for number in range(event_recorder.WAITING + 10):
-        record.tell(ES, "uid", Event("Normal", "A", str(number)))
+    for number in range(events.WAITING + 10):
+        record.tell(ES, "uid", PoolEvent("Normal", "A", str(number)))
     assert clock() == 0.0
     await asyncio.sleep(20)
     assert [event["message"] for event in api.store.list("events")] != []
     slow.late = 0.001
     await asyncio.sleep(30)
     told = [change.object["message"] for change in api.store.changes]
-    assert told == [str(number) for number in range(10, event_recorder.WAITING + 10)]
+    assert told == [str(number) for number in range(10, events.WAITING + 10)]
     running.cancel()
 
 
@@ -284,10 +285,10 @@ def test_events_without_the_lease_are_given_up() -> None:
         nonlocal held
         record = recorder(api, door)
         running = asyncio.ensure_future(record.run())
-        record.tell(ES, "uid", Event("Normal", "A", "before"))
+        record.tell(ES, "uid", PoolEvent("Normal", "A", "before"))
         await asyncio.sleep(1)
         held = True
-        record.tell(ES, "uid", Event("Normal", "A", "after"))
+        record.tell(ES, "uid", PoolEvent("Normal", "A", "after"))
         await asyncio.sleep(1)
         assert [event["message"] for event in api.store.list("events")] == ["after"]
         running.cancel()
@@ -304,7 +305,7 @@ async def test_events_differ_by_pool_reason_and_words(api: KubernetesApi, door: 
         ("1", "B", "a"),
         ("1", "A", "b"),
     ]:
-        await record.record(ES, uid, Event("Normal", reason, message))
+        await record.record(ES, uid, PoolEvent("Normal", reason, message))
     assert len(api.store.list("events")) == 4
 
 
@@ -317,9 +318,9 @@ def test_an_event_that_cannot_be_posted_is_forgotten(fault: Fault) -> None:
         record = recorder(api, door)
         fault.times = 1
         api.faults.append(fault)
-        await record.record(ES, "uid", Event("Normal", "A", "a"))
+        await record.record(ES, "uid", PoolEvent("Normal", "A", "a"))
         assert asyncio.get_running_loop().time() <= 5.1
-        await record.record(ES, "uid", Event("Normal", "A", "a"))
+        await record.record(ES, "uid", PoolEvent("Normal", "A", "a"))
         assert api.store.list("events") != []
 
     test()
@@ -327,17 +328,17 @@ def test_an_event_that_cannot_be_posted_is_forgotten(fault: Fault) -> None:
 
 @played
 async def test_a_long_message_is_cut(api: KubernetesApi, door: Cluster) -> None:
-    await recorder(api, door).record(ES, "uid", Event("Normal", "A", "a" * 5000))
+    await recorder(api, door).record(ES, "uid", PoolEvent("Normal", "A", "a" * 5000))
     (found,) = api.store.list("events")
-    assert len(found["message"]) == event_recorder.MESSAGE_LIMIT
+    assert len(found["message"]) == events.MESSAGE_LIMIT
 
 
 @played
 async def test_memory_of_events_is_bounded(api: KubernetesApi, door: Cluster) -> None:
     record = recorder(api, door)
-    for number in range(event_recorder.REMEMBERED + 10):
-        await record.record(ES, "uid", Event("Normal", "A", str(number)))
-    assert len(record._namespaces[ES.namespace].posted) == event_recorder.REMEMBERED
+    for number in range(events.REMEMBERED + 10):
+        await record.record(ES, "uid", PoolEvent("Normal", "A", str(number)))
+    assert len(record._namespaces[ES.namespace].posted) == events.REMEMBERED
 
 
 @played
@@ -347,10 +348,10 @@ async def test_a_namespace_without_recent_events_is_forgotten(
     record = recorder(api, door)
     running = asyncio.ensure_future(record.run())
     for number in range(100):
-        record.tell(Key(f"team-{number}", "es"), "uid", Event("Normal", "A", "a"))
-    await asyncio.sleep(2 * event_recorder.WINDOW)
+        record.tell(Key(f"team-{number}", "es"), "uid", PoolEvent("Normal", "A", "a"))
+    await asyncio.sleep(2 * events.WINDOW)
     for number in range(100):
-        record.tell(ES, "uid", Event("Normal", "A", str(number % 2)))
+        record.tell(ES, "uid", PoolEvent("Normal", "A", str(number % 2)))
         await asyncio.sleep(1)
     assert set(record._namespaces) == {ES.namespace}
     running.cancel()
@@ -363,10 +364,10 @@ async def test_the_events_of_one_namespace_neither_delay_nor_displace_anothers(
     record = recorder(api, door)
     running = asyncio.ensure_future(record.run())
     api.faults.append(Fault("create", "events", late=1.0, times=10**6))
-    record.tell(Key("well", "es"), "uid", Event("Normal", "A", "first"))
+    record.tell(Key("well", "es"), "uid", PoolEvent("Normal", "A", "first"))
     for number in range(10_000):
-        record.tell(ES, "uid", Event("Warning", "Broken", str(number)))
-    record.tell(Key("well", "es"), "uid", Event("Normal", "A", "second"))
+        record.tell(ES, "uid", PoolEvent("Warning", "Broken", str(number)))
+    record.tell(Key("well", "es"), "uid", PoolEvent("Normal", "A", "second"))
     await asyncio.sleep(2.5)
     told = [event["message"] for event in api.store.list("events", "well")]
     assert sorted(told) == ["first", "second"]

@@ -18,9 +18,9 @@ from fakes.certificates import make_certificates
 from fakes.kubernetes_api import Fault, KubernetesApi
 from fakes.store import Store
 from fakes.world import configuration
-from fiber_operator import cluster
+from fiber_operator import cluster, responses
 from fiber_operator.cluster import PAGE, PODS, POOLS, SECRETS, Cluster
-from fiber_operator.watch_session import open_watch_session
+from fiber_operator.watches import open_watch_session
 
 
 @contextlib.asynccontextmanager
@@ -62,7 +62,7 @@ def test_objects_are_made_read_changed_and_deleted() -> None:
         made["metadata"]["labels"] = {"new": "yes"}
         await door.replace(PODS, "here", "a", made)
         await door.delete(PODS, "here", "a", uid=made["metadata"]["uid"])
-        with pytest.raises(cluster.Gone):
+        with pytest.raises(responses.Gone):
             await door.read(PODS, "here", "a")
 
     with_api(test)
@@ -118,9 +118,9 @@ def test_a_dry_run_makes_nothing() -> None:
 def test_what_changed_is_not_deleted() -> None:
     async def test(api: KubernetesApi, door: Cluster) -> None:
         made = (await door.create(PODS, "here", pod("a")))["metadata"]
-        with pytest.raises(cluster.Conflict):
+        with pytest.raises(responses.Conflict):
             await door.delete(PODS, "here", "a", uid="another")
-        with pytest.raises(cluster.Conflict):
+        with pytest.raises(responses.Conflict):
             await door.delete(PODS, "here", "a", uid=made["uid"], resource_version="1")
         assert len(api.store.list("pods")) == 1
 
@@ -130,20 +130,20 @@ def test_what_changed_is_not_deleted() -> None:
 @pytest.mark.parametrize(
     ("status", "error"),
     [
-        (400, cluster.Invalid),
-        (401, cluster.Unavailable),
-        (403, cluster.Refused),
-        (404, cluster.Gone),
-        (405, cluster.Invalid),
-        (409, cluster.Conflict),
-        (410, cluster.Unavailable),
-        (422, cluster.Invalid),
-        (429, cluster.TooMany),
-        (500, cluster.Unavailable),
-        (503, cluster.Unavailable),
+        (400, responses.Invalid),
+        (401, responses.Unavailable),
+        (403, responses.Refused),
+        (404, responses.Gone),
+        (405, responses.Invalid),
+        (409, responses.Conflict),
+        (410, responses.Unavailable),
+        (422, responses.Invalid),
+        (429, responses.TooMany),
+        (500, responses.Unavailable),
+        (503, responses.Unavailable),
     ],
 )
-def test_each_status_is_one_error(status: int, error: type[cluster.ApiError]) -> None:
+def test_each_status_is_one_error(status: int, error: type[responses.ApiError]) -> None:
     async def test(api: KubernetesApi, door: Cluster) -> None:
         api.faults.append(Fault(status=status, reason="Because", message="words of the server"))
         with pytest.raises(error) as caught:
@@ -159,7 +159,7 @@ def test_each_status_is_one_error(status: int, error: type[cluster.ApiError]) ->
 def test_too_many_requests_says_when_to_come_back(header: float | None, seconds: float) -> None:
     async def test(api: KubernetesApi, door: Cluster) -> None:
         api.faults.append(Fault(status=429, retry_after=header))
-        with pytest.raises(cluster.TooMany) as caught:
+        with pytest.raises(responses.TooMany) as caught:
             await door.read(PODS, "here", "a")
         assert caught.value.retry_after == seconds
 
@@ -176,7 +176,7 @@ def test_nonsense_is_no_answer(text: str, verb: str) -> None:
             "list": lambda: door.list(PODS, "here", names_of),
             "create": lambda: door.create(PODS, "here", pod("a")),
         }
-        with pytest.raises(cluster.Unavailable):
+        with pytest.raises(responses.Unavailable):
             await calls[verb]()
 
     with_api(test)
@@ -193,7 +193,7 @@ def test_what_is_not_the_object_is_no_answer(text: str) -> None:
             door.replace(PODS, "here", "a", pod("a")),
             door.patch(PODS, "here", "a", {}),
         ):
-            with pytest.raises(cluster.Unavailable, match="not the object a"):
+            with pytest.raises(responses.Unavailable, match="not the object a"):
                 await call
 
     with_api(test)
@@ -213,7 +213,7 @@ def test_what_is_not_the_object_is_no_answer(text: str) -> None:
 def test_what_is_no_list_is_not_an_empty_one(text: str) -> None:
     async def test(api: KubernetesApi, door: Cluster) -> None:
         api.faults.append(Fault(text=text))
-        with pytest.raises(cluster.Unavailable):
+        with pytest.raises(responses.Unavailable):
             await door.list(PODS, "here", names_of)
 
     with_api(test)
@@ -224,7 +224,7 @@ def test_a_page_not_found_is_not_an_object_gone() -> None:
 
     async def test(api: KubernetesApi, door: Cluster) -> None:
         api.faults.append(Fault(status=404, text="404 page not found"))
-        with pytest.raises(cluster.Unavailable, match="404 page not found"):
+        with pytest.raises(responses.Unavailable, match="404 page not found"):
             await door.read(PODS, "here", "a")
 
     with_api(test)
@@ -233,9 +233,9 @@ def test_a_page_not_found_is_not_an_object_gone() -> None:
 def test_no_connection_and_no_answer_are_unavailable() -> None:
     async def test(api: KubernetesApi, door: Cluster) -> None:
         api.faults += [Fault(), Fault(late=1000)]
-        with pytest.raises(cluster.Unavailable):
+        with pytest.raises(responses.Unavailable):
             await door.create(PODS, "here", pod("a"))
-        with pytest.raises(cluster.Unavailable, match="no answer in time"):
+        with pytest.raises(responses.Unavailable, match="no answer in time"):
             await door.read(PODS, "here", "a")
 
     with_api(test)
@@ -244,7 +244,7 @@ def test_no_connection_and_no_answer_are_unavailable() -> None:
 def test_no_server_is_unavailable() -> None:
     async def main() -> None:
         door = Cluster(Configuration(host="http://127.0.0.1:9"), connections=1)
-        with pytest.raises(cluster.Unavailable):
+        with pytest.raises(responses.Unavailable):
             await door.read(PODS, "here", "a")
         await door.close()
 
@@ -282,7 +282,7 @@ def test_a_write_lasts_no_longer_than_is_permitted() -> None:
         ):
             api.faults.append(Fault(verb, late=60.0))
             began = clock()
-            with pytest.raises(cluster.Unavailable):
+            with pytest.raises(responses.Unavailable):
                 await call()
             assert 2.9 < clock() - began < 3.5
 
@@ -296,7 +296,7 @@ def test_every_call_is_observed() -> None:
         await door.list(SECRETS, "here", names_of)
         api.faults += [Fault(status=409), Fault(), Fault(text="no")]
         for _ in range(3):
-            with pytest.raises(cluster.ApiError):
+            with pytest.raises(responses.ApiError):
                 await door.patch(PODS, "here", "a", {}, "status")
 
     with_api(

@@ -14,8 +14,8 @@ from fakes.store import Body, Failure
 from fakes.world import NAMESPACE, TEMPLATE, World, played
 from fiber_api.names import Reason
 from fiber_api.v1alpha1 import FiberPool
-from fiber_operator.planning import wording
-from fiber_operator.planning.plans import Refusal
+from fiber_operator.planning import messages
+from fiber_operator.planning.plans import PodRefusal
 from fiber_operator.planning.podspec import pod
 from unit.operator_objects import MASTER, NOW, make_pool
 
@@ -142,7 +142,7 @@ WEBHOOK = 'admission webhook "images.example" denied the request: not signed yet
 def test_400_blames_the_template_in_a_dry_run_alone(
     status: int, message: str, dry_run: bool, reason: Reason
 ) -> None:
-    assert Refusal("hash", status, message, NOW, dry_run=dry_run).reason == reason
+    assert PodRefusal("hash", status, message, NOW, dry_run=dry_run).reason == reason
 
 
 @pytest.mark.parametrize(
@@ -165,16 +165,16 @@ def test_400_blames_the_template_in_a_dry_run_alone(
     ],
 )
 def test_a_limit_range_is_told_with_what_to_do(status: int, message: str) -> None:
-    refused = Refusal("hash", status, message, NOW, dry_run=True)
-    told = wording.refusal(refused.reason, refused)
+    refused = PodRefusal("hash", status, message, NOW, dry_run=True)
+    told = messages.refusal(refused.reason, refused)
     assert message.partition(": ")[2] in told
     assert "kubectl get limitranges" in told
     assert "fiber.init(cpu_request=0, memory_request=0)" in told
 
 
 def test_a_refusal_for_something_else_speaks_of_no_limit_range() -> None:
-    refused = Refusal("hash", 403, "no right", NOW)
-    assert "limitranges" not in wording.refusal(refused.reason, refused)
+    refused = PodRefusal("hash", 403, "no right", NOW)
+    assert "limitranges" not in messages.refusal(refused.reason, refused)
 
 
 @played

@@ -12,7 +12,7 @@ import yaml
 from fakes.kubernetes_api import Fault
 from fakes.store import Body
 from fakes.world import NAMESPACE, World, played
-from fiber_operator.planning.situation import SECOND_LOOK
+from fiber_operator.planning.problems import SECOND_LOOK
 from unit.operator_objects import MASTER
 
 LOST = {**MASTER, "leaseName": "es", "leaseDurationSeconds": 6, "lostGraceSeconds": 5}

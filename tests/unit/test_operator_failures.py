@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from fiber_api.v1alpha1 import FailurePolicy, Failures
 from fiber_operator.planning.failures import Account, account, delay, given_up, held_back_until
-from fiber_operator.planning.pods import PodView, State, Trouble
+from fiber_operator.planning.pods import PodState, PodView, Trouble
 from unit.operator_cluster_model import view
 from unit.operator_objects import NOW, name_of
 
@@ -38,7 +38,7 @@ def count(
 def failed(number: int, *, created: float = NOW - 60, ago: float = 0, **fields: Any) -> PodView:
     known = {"trouble": Trouble.APPLICATION, "reason": "Error", "exit_code": 1, "ran": 1.0}
     known |= {"created": created, "since": NOW - ago, "template_hash": "new"}
-    return view(number, State.ENDED, **{**known, **fields})
+    return view(number, PodState.ENDED, **{**known, **fields})
 
 
 def lived(number: int, **fields: Any) -> PodView:
@@ -47,7 +47,7 @@ def lived(number: int, **fields: Any) -> PodView:
 
 
 def ready(number: int, *, since: float = NOW) -> PodView:
-    return view(number, State.READY, created=since, since=since, template_hash="new")
+    return view(number, PodState.READY, created=since, since=since, template_hash="new")
 
 
 @given(waves=st.integers(-1, 10**9), seed=st.text())
@@ -242,16 +242,16 @@ def test_sums_stay_what_a_status_may_hold() -> None:
         **dict.fromkeys(("total", "disrupted", "consecutive", "waves", "waiting"), most),
         next_create_time=NOW - 1,
     )
-    ended = view(3, State.ENDED, trouble=Trouble.DISRUPTED)
+    ended = view(3, PodState.ENDED, trouble=Trouble.DISRUPTED)
     found = count(full, failed(1), failed(2, created=NOW + 5), ended).failures
     assert (found.total, found.disrupted, found.consecutive, found.waves) == (most,) * 4
 
 
 def test_what_the_cluster_ends_is_disrupted_once_and_waits_for_nothing() -> None:
-    drained = view(1, State.TERMINATING, trouble=Trouble.DISRUPTED)
-    evicted = view(2, State.ENDED, trouble=Trouble.DISRUPTED)
-    deleted = view(3, State.TERMINATING)
-    marked = view(4, State.READY, trouble=Trouble.DISRUPTED)
+    drained = view(1, PodState.TERMINATING, trouble=Trouble.DISRUPTED)
+    evicted = view(2, PodState.ENDED, trouble=Trouble.DISRUPTED)
+    deleted = view(3, PodState.TERMINATING)
+    marked = view(4, PodState.READY, trouble=Trouble.DISRUPTED)
     found = count(Failures(), drained, evicted, deleted, marked)
     assert [pod.name for pod in found.disrupted] == [name_of(1), name_of(2)]
     assert (found.failures.disrupted, found.failures.total, found.held_back) == (2, 0, 0)
@@ -259,7 +259,7 @@ def test_what_the_cluster_ends_is_disrupted_once_and_waits_for_nothing() -> None
 
 
 def test_a_pod_that_was_late_and_became_ready_is_like_any_other() -> None:
-    late = view(1, State.STARTING, template_hash="new")
+    late = view(1, PodState.STARTING, template_hash="new")
     first = count(Failures(), late, late={late.name}).failures
     assert (first.total, first.last_reason) == (1, "StartupTimeout")
     kept = count(first, ready(1)).failures
@@ -268,7 +268,9 @@ def test_a_pod_that_was_late_and_became_ready_is_like_any_other() -> None:
 
 def test_what_has_no_room_in_the_status_is_counted_later(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fiber_operator.planning.failures.NAMES", 6)
-    stuck = [view(number, State.TERMINATING, trouble=Trouble.DISRUPTED) for number in range(20, 29)]
+    stuck = [
+        view(number, PodState.TERMINATING, trouble=Trouble.DISRUPTED) for number in range(20, 29)
+    ]
     full = count(Failures(), *stuck).failures
     assert full.disrupted == 3
     assert count(full, *stuck).failures == full.model_copy(update={"spec_hash": "spec"})

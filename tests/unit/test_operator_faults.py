@@ -10,7 +10,7 @@ import pytest
 from fakes import virtual_time
 from fakes.kubernetes_api import Call, Fault
 from fakes.world import NAMESPACE, OWN_LEASE, World, a_world, played
-from fiber_operator import apply
+from fiber_operator import controller
 from unit.operator_objects import MASTER
 
 CALLS = [
@@ -384,7 +384,7 @@ async def test_a_master_that_attaches_during_a_long_deletion_keeps_who_is_left(
     a_master_attaches_after("delete", "pods", world, replicas=200)
     world.edit(replicas=10)
     await world.settled(60)
-    assert 0 < len(world.deleted()) <= apply.DELETIONS
+    assert 0 < len(world.deleted()) <= controller.DELETIONS
 
 
 @played

@@ -18,11 +18,11 @@ from fiber_api.times import format_time
 from fiber_api.v1alpha1 import FiberPool, InvalidPool
 from fiber_operator.metrics import PoolSample
 from fiber_operator.planning import plans
-from fiber_operator.planning.plans import Memory, Plan
+from fiber_operator.planning.manifests import template_hash
+from fiber_operator.planning.plans import Knowledge, Plan
 from fiber_operator.planning.pods import PodView, observe
 from fiber_operator.planning.podspec import pod
 from fiber_operator.planning.reconcile import plan, plan_unreadable
-from fiber_operator.planning.revisions import template_hash
 from unit.operator_objects import (
     ADDRESS,
     MASTER,
@@ -143,12 +143,14 @@ def troubled(**spec: Any) -> Body:
     document["metadata"]["creationTimestamp"] = format_time(NOW - 1000)
     pool = FiberPool.read(document)
     pods = views(pool, ended(1, code=3), waiting(2, "ErrImagePull"), running(3), unschedulable(4))
-    made = plan(pool, pods, memory(pool, alive=False), NOW)
+    made = plan(pool, pods, knowledge(pool, alive=False), NOW)
     return {**document, "status": written(made)}
 
 
-def memory(pool: FiberPool, alive: bool | None) -> Memory:
-    return Memory(address=ADDRESS, accepted=template_hash(pool), master=plans.LeaseVerdict(alive))
+def knowledge(pool: FiberPool, alive: bool | None) -> Knowledge:
+    return Knowledge(
+        address=ADDRESS, accepted=template_hash(pool), master=plans.LeaseVerdict(alive)
+    )
 
 
 def written(made: Plan) -> Body:
@@ -167,7 +169,7 @@ VIEWS = [
 
 def check_plan(pool: FiberPool, document: Body, pods: list[PodView], alive: bool | None) -> Plan:
     """What must hold of any: it can be written, is what was written, and stays so."""
-    known = memory(pool, alive)
+    known = knowledge(pool, alive)
     made = plan(pool, pods, known, NOW)
     if made.status is not None:
         after = FiberPool.read({**document, "status": written(made)})
@@ -262,7 +264,7 @@ def test_a_worker_goes_for_nothing_that_has_the_wrong_type(
     current = template_hash(pool)
     pods = [of_template(current, running(number)) for number in (10, 11, 12)]
     pods[0] = spoilt_in_type(data.draw, pods[0])
-    assert plan(pool, views_of(pool, pods), memory(pool, None), NOW).delete == ()
+    assert plan(pool, views_of(pool, pods), knowledge(pool, None), NOW).delete == ()
 
 
 def spoilt_in_type(draw: Any, document: Body) -> Body:

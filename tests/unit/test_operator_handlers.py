@@ -19,11 +19,12 @@ from fakes.kubernetes_api import Fault
 from fakes.store import Body
 from fakes.world import NAMESPACE, World, a_world, configuration
 from fiber_api import names
-from fiber_operator import handlers
-from fiber_operator.cluster import ApiError, Configuration, load_configuration
-from fiber_operator.handlers import Watcher
-from fiber_operator.program import Program
-from fiber_operator.settings import Settings
+from fiber_operator import watches
+from fiber_operator.cluster import Configuration, load_configuration
+from fiber_operator.process import OperatorProcess
+from fiber_operator.responses import ApiError
+from fiber_operator.settings import OperatorSettings
+from fiber_operator.watches import KopfThread
 from fiber_operator.workqueue import Key
 
 ES = Key(NAMESPACE, "es")
@@ -46,7 +47,7 @@ class Watching:
         self.gates = 0
         self.stop = asyncio.Event()
         self._task = asyncio.ensure_future(
-            handlers.watch(
+            watches.watch(
                 lambda *notice: self.notices.append(notice),
                 renewed=lambda *renewal: self.renewals.append(renewal),
                 configure=self._configure,
@@ -368,8 +369,8 @@ def test_the_thread_tells_the_loop_that_made_it_and_ends_with_it() -> None:
             async def configure() -> Configuration:
                 return configuration(world.api)
 
-            settings = Settings(host="127.0.0.1", port=0, identity="operator-1")
-            program = Program(settings, configure=configure, now=world.store.unix_now)
+            settings = OperatorSettings(host="127.0.0.1", port=0, identity="operator-1")
+            program = OperatorProcess(settings, configure=configure, now=world.store.unix_now)
             task = asyncio.ensure_future(program.run(stop))
             world.make_pool(replicas=2)
             await world.ready(2, within=10)
@@ -392,7 +393,7 @@ def test_a_fault_of_ours_holds_up_no_other_event() -> None:
             if what == "bad":
                 raise KeyError("a fault of ours")
 
-        watcher = Watcher(
+        watcher = KopfThread(
             lambda *_: None,
             configure=load_configuration,
             namespaces=(),
@@ -404,7 +405,7 @@ def test_a_fault_of_ours_holds_up_no_other_event() -> None:
         for pair in (("bad", "good"), ("bad", "again")):
             for what in pair:
                 tell(what)
-            await asyncio.sleep(2 * handlers.TOGETHER)
+            await asyncio.sleep(2 * watches.TOGETHER)
         assert told == ["bad", "good", "bad", "again"]
 
     virtual_time.run(main())
@@ -415,7 +416,7 @@ def test_a_thread_that_cannot_watch_ends_the_program() -> None:
         def fail() -> None:
             raise KeyError("a fault of ours")
 
-        watcher = Watcher(
+        watcher = KopfThread(
             lambda *_: None,
             configure=load_configuration,
             namespaces=(),
@@ -458,5 +459,5 @@ def test_a_kopf_that_does_not_end_is_ended(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_patience_never_ends() -> None:
-    delays = iter(handlers._Patience())
+    delays = iter(watches._Patience())
     assert max(itertools.islice(delays, 10_000)) == 5

@@ -13,8 +13,9 @@ from fakes import virtual_time
 from fakes.kubernetes_api import Fault, KubernetesApi
 from fakes.store import Body, Store
 from fakes.world import configuration
-from fiber_operator.cluster import PODS, Cluster, Unavailable
-from fiber_operator.leader_election import LeaderElector, NotLeader
+from fiber_operator.cluster import PODS, Cluster
+from fiber_operator.operator_leases import LeaderElector, NotLeader
+from fiber_operator.responses import Unavailable
 
 NAMESPACE, NAME, SECONDS = "fiber-system", "fiber-operator", 15
 

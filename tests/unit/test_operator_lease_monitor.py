@@ -15,12 +15,7 @@ from fakes.store import Store
 from fakes.world import configuration
 from fiber_api.names import ANNOTATION_CONNECTED
 from fiber_operator.cluster import Cluster
-from fiber_operator.lease_monitor import (
-    MISSING_AFTER,
-    LeaseMonitor,
-    MasterLease,
-    connected_in,
-)
+from fiber_operator.lease_monitor import MISSING_AFTER, LeaseMonitor, MasterLease, connected_in
 from fiber_operator.planning.plans import LeaseVerdict
 from fiber_operator.workqueue import Key
 

@@ -12,8 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fiber_operator.api_errors import Unavailable
-from fiber_operator.listing import PIECE, Listing
+from fiber_operator.responses import PIECE, ListReader, Unavailable
 
 Json = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(),
@@ -30,7 +29,7 @@ async def pieces(data: bytes, size: int) -> AsyncIterator[bytes]:
 
 def read(data: bytes, size: int = 7) -> tuple[list[Any], str]:
     async def main() -> tuple[list[Any], str]:
-        listing = Listing(pieces(data, size), "list pods")
+        listing = ListReader(pieces(data, size), "list pods")
         return [item async for item in listing], listing.more()
 
     return asyncio.run(main())
@@ -111,7 +110,7 @@ def test_one_object_at_a_time_is_in_memory() -> None:
 
     async def main() -> int:
         seen = 0
-        async for found in Listing(answer(), "list pods"):
+        async for found in ListReader(answer(), "list pods"):
             seen += len(found["large"]) > 500_000
         return seen
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from fiber_api import names
 from fiber_operator.planning import manifests
+from fiber_operator.planning.podspec import pod
 from unit.operator_objects import MASTER, UID, make_pool
 
 
@@ -16,7 +17,7 @@ def test_everything_belongs_to_the_pool() -> None:
         manifests.service(pool),
         manifests.endpoint_slice(pool),
         manifests.secret(pool, {}),
-        manifests.pod(pool, "es-0000000001", "10.96.1.2:7070"),
+        pod(pool, "es-0000000001", "10.96.1.2:7070"),
     ]
     for body in bodies:
         metadata = body["metadata"]

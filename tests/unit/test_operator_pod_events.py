@@ -14,16 +14,16 @@ from fakes.kubernetes_api import KubernetesApi
 from fakes.store import Body, Store
 from fakes.world import NAMESPACE, World, a_world, configuration
 from fiber_api.times import format_time
-from fiber_operator import pod_events
 from fiber_operator.cluster import Cluster
-from fiber_operator.planning.pods import PodView, State
+from fiber_operator.events import pod_warnings
+from fiber_operator.planning.pods import PodState, PodView
 from fiber_operator.workqueue import Key
 from unit.operator_cluster_model import view
 from unit.operator_objects import NOW
 from unit.test_operator_pods import ANYTHING
 
 MOUNT = ("Warning", "FailedMount")
-POD = view(1, State.PENDING)
+POD = view(1, PodState.PENDING)
 
 
 def event(said: tuple[str, str], second: float = 0.0, **fields: Any) -> Body:
@@ -51,7 +51,7 @@ def warning_of(*events: Body, pod: PodView = POD) -> str:
         async with api.serving():
             door = Cluster(configuration(api), connections=1)
             try:
-                return await pod_events.warnings(door, Key("team", "es"), [pod.name], [pod])
+                return await pod_warnings(door, Key("team", "es"), [pod.name], [pod])
             finally:
                 await door.close()
 

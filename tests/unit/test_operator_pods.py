@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fiber_operator.planning.pods import LONGEST_MESSAGE, PodView, State, Trouble, observe
+from fiber_operator.planning.pods import LONGEST_MESSAGE, PodState, PodView, Trouble, observe
 from unit.operator_objects import (
     NOW,
     UID,
@@ -28,7 +28,7 @@ def look(document: dict[str, Any]) -> PodView:
 
 def test_a_new_pod_is_pending() -> None:
     pod = look(pod_document(3, age=2))
-    assert pod.state is State.PENDING
+    assert pod.state is PodState.PENDING
     assert pod.trouble is None
     assert (pod.owner, pod.created, pod.since) == (UID, NOW - 2, NOW - 2)
     assert pod.live
@@ -36,23 +36,23 @@ def test_a_new_pod_is_pending() -> None:
 
 
 def test_a_pod_is_starting_until_it_is_ready() -> None:
-    assert look(running(ready=False)).state is State.STARTING
+    assert look(running(ready=False)).state is PodState.STARTING
     ready = look(running(age=50))
-    assert (ready.state, ready.since, ready.was_ready) == (State.READY, NOW - 49, True)
+    assert (ready.state, ready.since, ready.was_ready) == (PodState.READY, NOW - 49, True)
 
 
 def test_a_pod_that_was_ready_is_not_one_that_never_was() -> None:
     document = running(age=100)
     document["status"]["conditions"] = [condition("Ready", "False", ago=5, message="node silent")]
     pod = look(document)
-    assert (pod.state, pod.was_ready, pod.since) == (State.NOT_READY, True, NOW - 5)
+    assert (pod.state, pod.was_ready, pod.since) == (PodState.NOT_READY, True, NOW - 5)
     assert pod.message == "node silent"
 
 
 def test_a_deleted_pod_is_terminating_whatever_else() -> None:
     for document in (running(), ended(), waiting(1, "ErrImagePull"), pod_document()):
         pod = look(terminating(document))
-        assert pod.state is State.TERMINATING
+        assert pod.state is PodState.TERMINATING
         assert not pod.live
 
 
@@ -62,7 +62,7 @@ def test_a_deleted_pod_is_terminating_whatever_else() -> None:
 )
 def test_what_the_kubelet_retries_cannot_start(reason: str) -> None:
     pod = look(waiting(1, reason, "why"))
-    assert (pod.state, pod.trouble) == (State.PENDING, Trouble.CANNOT_START)
+    assert (pod.state, pod.trouble) == (PodState.PENDING, Trouble.CANNOT_START)
     assert (pod.reason, pod.message) == (reason, "why")
 
 
@@ -87,7 +87,7 @@ def test_unschedulable_says_what_the_scheduler_says() -> None:
 
 def test_a_failed_worker_is_the_applications() -> None:
     pod = look(ended(code=3, ran=30, ago=4, message="Traceback\nKeyError: 1\n"))
-    assert (pod.state, pod.trouble) == (State.ENDED, Trouble.APPLICATION)
+    assert (pod.state, pod.trouble) == (PodState.ENDED, Trouble.APPLICATION)
     assert (pod.exit_code, pod.ran, pod.since) == (3, 30, NOW - 4)
     assert pod.message == "Traceback\nKeyError: 1"
     assert not pod.lingers
@@ -166,7 +166,7 @@ def test_a_worker_has_ended_even_if_its_sidecar_goes_on() -> None:
     document = ended(code=1, phase="Running")
     document["status"]["containerStatuses"].append({"name": "x", "state": {"running": {}}})
     pod = look(document)
-    assert pod.state is State.ENDED
+    assert pod.state is PodState.ENDED
     assert pod.lingers
 
 
@@ -186,8 +186,8 @@ def test_the_judged_container_is_the_one_that_is_named() -> None:
     document = running()
     end = {"exitCode": 1, "reason": "Error"}
     document["status"]["containerStatuses"].append({"name": "x", "state": {"terminated": end}})
-    assert look(document).state is State.READY
-    assert observe(document, "x").state is State.ENDED
+    assert look(document).state is PodState.READY
+    assert observe(document, "x").state is PodState.ENDED
 
 
 def test_a_long_message_keeps_its_end() -> None:
@@ -210,7 +210,7 @@ def test_an_end_without_an_exit_code_is_none(code: Any) -> None:
     end = {"terminated": {"exitCode": code, "reason": "Error"}}
     document["status"]["containerStatuses"][0]["state"] = end
     pod = look(document)
-    assert (pod.state, pod.exit_code) == (State.READY, None)
+    assert (pod.state, pod.exit_code) == (PodState.READY, None)
 
 
 @pytest.mark.parametrize("conditions", [None, [], "x", [{"type": "Ready", "status": "Unknown"}]])
@@ -218,7 +218,7 @@ def test_a_worker_that_runs_and_of_which_nobody_can_tell_may_have_been_ready(
     conditions: Any,
 ) -> None:
     pod = look({**running(), "status": {**running()["status"], "conditions": conditions}})
-    assert (pod.state, pod.was_ready) == (State.NOT_READY, True)
+    assert (pod.state, pod.was_ready) == (PodState.NOT_READY, True)
 
 
 ANYTHING = st.recursive(
@@ -260,7 +260,7 @@ def test_junk_anywhere_is_still_a_pod(path: tuple[str | int, ...], junk: Any) ->
             place = place[key]
         place[path[-1]] = junk
     pod = look(document)
-    assert isinstance(pod.state, State)
+    assert isinstance(pod.state, PodState)
     assert isinstance(pod.name, str)
     assert isinstance(pod.message, str)
     assert isinstance(pod.since, float)

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from fiber_api import names
 from fiber_api.v1alpha1 import FiberPool
+from fiber_operator.planning.manifests import spec_hash, template_hash
 from fiber_operator.planning.podspec import NODE_LOST_SECONDS, pod
-from fiber_operator.planning.revisions import spec_hash, template_hash
 from unit.operator_objects import MASTER, UID, make_pool, pool_document
 from unit.test_operator_pods import ANYTHING
 

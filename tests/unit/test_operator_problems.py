@@ -8,9 +8,9 @@ import pytest
 
 from fiber_api.names import Reason
 from fiber_api.v1alpha1 import FiberPool, FiberPoolStatus, Problem
-from fiber_operator.planning import plans, wording
-from fiber_operator.planning.plans import Obstacle, Refusal
-from fiber_operator.planning.revisions import spec_hash, template_hash
+from fiber_operator.planning import messages, plans
+from fiber_operator.planning.manifests import spec_hash, template_hash
+from fiber_operator.planning.plans import Obstacle, PodRefusal
 from unit.operator_objects import (
     MASTER,
     NOW,
@@ -334,7 +334,7 @@ def test_past_the_limit_the_first_problem_says_what_to_do() -> None:
 def test_a_refusal_is_told_in_the_api_servers_words(
     code: int, said: str, reason: str, terminal: bool
 ) -> None:
-    refused = Refusal(template_hash(POOL), code, said, NOW)
+    refused = PodRefusal(template_hash(POOL), code, said, NOW)
     status = status_of(POOL, refusal=refused)
     (found,) = status.problems
     assert (found.reason, found.terminal, found.severity) == (reason, terminal, "Error")
@@ -345,7 +345,7 @@ def test_a_refusal_is_told_in_the_api_servers_words(
 
 def test_an_account_that_is_not_there_yet_is_a_warning_first_and_tried_again_at_once() -> None:
     said = 'pods "es-1" is forbidden: error looking up service account team/default: not found'
-    refused = Refusal(template_hash(POOL), 403, said, NOW, 5, True)
+    refused = PodRefusal(template_hash(POOL), 403, said, NOW, 5, True)
     status = status_of(POOL, refusal=refused)
     (found,) = status.problems
     assert (found.reason, found.severity, found.terminal) == ("Forbidden", "Warning", False)
@@ -355,13 +355,13 @@ def test_an_account_that_is_not_there_yet_is_a_warning_first_and_tried_again_at_
 
 
 def test_a_full_quota_is_no_problem_to_a_pool_that_wants_no_more() -> None:
-    refused = Refusal(template_hash(POOL), 403, "exceeded quota", NOW)
+    refused = PodRefusal(template_hash(POOL), 403, "exceeded quota", NOW)
     assert status_of(POOL, running(1), refusal=refused).problems == ()
 
 
 def test_a_namespace_that_is_deleted_is_no_problem_of_its_pools() -> None:
     said = "unable to create new content in namespace team because it is being terminated"
-    refused = Refusal(template_hash(POOL), 403, f'pods "es-1" is forbidden: {said}', NOW)
+    refused = PodRefusal(template_hash(POOL), 403, f'pods "es-1" is forbidden: {said}', NOW)
     assert status_of(POOL, refusal=refused).problems == ()
 
 
@@ -412,10 +412,10 @@ def test_a_master_of_the_other_address_family_is_told() -> None:
 
 
 def test_a_master_of_either_family_of_the_service_is_right() -> None:
-    memory = "10.96.1.2:7070,[fd00:96::2]:7070"
+    addresses = "10.96.1.2:7070,[fd00:96::2]:7070"
     for host in ("10.0.3.7", "fd00::7"):
         pool = make_pool(replicas=1, master={**MASTER, "host": host})
-        assert status_of(pool, running(1), address=memory).problems == ()
+        assert status_of(pool, running(1), address=addresses).problems == ()
 
 
 def test_names_that_are_no_workers_are_told() -> None:
@@ -446,4 +446,4 @@ def test_the_worst_comes_first_and_there_are_ten_at_most() -> None:
     ],
 )
 def test_the_words_of_the_cluster_end_a_clause(said: str, ending: str) -> None:
-    assert wording.quoted(said) == ending
+    assert messages.quoted(said) == ending

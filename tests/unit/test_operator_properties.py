@@ -14,11 +14,10 @@ from fiber_api.times import format_time
 from fiber_api.v1alpha1 import FiberPool, InvalidPool
 from fiber_operator.planning import plans
 from fiber_operator.planning.failures import held_back_until
-from fiber_operator.planning.plans import Memory, Obstacle, Plan, Refusal
-from fiber_operator.planning.pods import PodView, State, Trouble
-from fiber_operator.planning.reconcile import plan, plan_unreadable
-from fiber_operator.planning.revisions import spec_hash, template_hash
-from fiber_operator.planning.scaling import CANARIES, PATIENCE
+from fiber_operator.planning.manifests import spec_hash, template_hash
+from fiber_operator.planning.plans import Knowledge, Obstacle, Plan, PodRefusal
+from fiber_operator.planning.pods import PodState, PodView, Trouble
+from fiber_operator.planning.reconcile import CANARIES, PATIENCE, plan, plan_unreadable
 from unit.operator_cluster_model import Model, view
 from unit.operator_objects import ADDRESS, MASTER, NOW, make_pool, name_of, pool_document
 from unit.test_operator_pods import ANYTHING
@@ -27,13 +26,13 @@ NO_SHRINKING = (Phase.explicit, Phase.reuse, Phase.generate)
 """For what takes long: a failure is shown as it was found."""
 
 NUMBERS = st.integers(0, 15)
-TROUBLES: dict[State, list[Trouble | None]] = {
-    State.PENDING: [None, Trouble.CANNOT_START, Trouble.UNSCHEDULABLE],
-    State.STARTING: [None],
-    State.READY: [None],
-    State.NOT_READY: [None],
-    State.TERMINATING: [None, Trouble.DISRUPTED],
-    State.ENDED: [Trouble.APPLICATION, Trouble.COMPLETED, Trouble.DISRUPTED],
+TROUBLES: dict[PodState, list[Trouble | None]] = {
+    PodState.PENDING: [None, Trouble.CANNOT_START, Trouble.UNSCHEDULABLE],
+    PodState.STARTING: [None],
+    PodState.READY: [None],
+    PodState.NOT_READY: [None],
+    PodState.TERMINATING: [None, Trouble.DISRUPTED],
+    PodState.ENDED: [Trouble.APPLICATION, Trouble.COMPLETED, Trouble.DISRUPTED],
 }
 REASONS = ["", "ErrImagePull", "ImagePullBackOff", "OOMKilled", "Evicted", "InvalidImageName"]
 
@@ -42,7 +41,7 @@ REASONS = ["", "ErrImagePull", "ImagePullBackOff", "OOMKilled", "Evicted", "Inva
 def pods_of(draw: st.DrawFn, hash_: str) -> list[PodView]:
     pods = []
     for number in draw(st.sets(NUMBERS)):
-        state = draw(st.sampled_from(State))
+        state = draw(st.sampled_from(PodState))
         age = draw(st.sampled_from([0, 1, 7, 20, 59, 61, 3000]))
         pods.append(
             view(
@@ -115,10 +114,10 @@ def statuses(draw: st.DrawFn, spec: dict[str, Any]) -> dict[str, Any]:
 
 
 @st.composite
-def memories(draw: st.DrawFn, hash_: str) -> Memory:
-    refusal = Refusal(hash_, draw(st.sampled_from([403, 422])), "no", NOW - 3)
+def knowledges(draw: st.DrawFn, hash_: str) -> Knowledge:
+    refusal = PodRefusal(hash_, draw(st.sampled_from([403, 422])), "no", NOW - 3)
     obstacle = Obstacle(Reason.NAME_TAKEN, "taken")
-    return Memory(
+    return Knowledge(
         address=draw(st.sampled_from([ADDRESS] * 4 + [None])),
         obstacles=draw(st.sampled_from([()] * 4 + [(obstacle,)])),
         accepted=draw(st.sampled_from([hash_, hash_, "older", None])),
@@ -134,14 +133,14 @@ def memories(draw: st.DrawFn, hash_: str) -> Memory:
 @st.composite
 def cases(
     draw: st.DrawFn, specs: st.SearchStrategy[dict[str, Any]] = SPECS
-) -> tuple[FiberPool, list[PodView], Memory]:
+) -> tuple[FiberPool, list[PodView], Knowledge]:
     spec = draw(specs)
     pool = make_pool(draw(statuses(spec)), **spec)
     hash_ = template_hash(pool)
-    return pool, draw(pods_of(hash_)), draw(memories(hash_))
+    return pool, draw(pods_of(hash_)), draw(knowledges(hash_))
 
 
-Case = tuple[FiberPool, list[PodView], Memory]
+Case = tuple[FiberPool, list[PodView], Knowledge]
 
 
 def own(pool: FiberPool, pods: list[PodView]) -> dict[str, PodView]:
@@ -155,26 +154,26 @@ def after(pool: FiberPool, made: Plan) -> FiberPool:
 
 
 def only_pods_of_the_pool_are_deleted_and_each_once(
-    made: Plan, pool: FiberPool, pods: list[PodView], memory: Memory
+    made: Plan, pool: FiberPool, pods: list[PodView], knowledge: Knowledge
 ) -> None:
     names = [deletion.name for deletion in made.delete]
     assert len(set(names)) == len(names)
     known = own(pool, pods)
     for deletion in made.delete:
         assert deletion.uid == known[deletion.name].uid
-        assert known[deletion.name].state is not State.TERMINATING
+        assert known[deletion.name].state is not PodState.TERMINATING
 
 
 def a_pool_is_deleted_for_a_lease_that_this_process_saw_expire_alone(
-    made: Plan, pool: FiberPool, pods: list[PodView], memory: Memory
+    made: Plan, pool: FiberPool, pods: list[PodView], knowledge: Knowledge
 ) -> None:
     if made.delete_pool:
-        assert memory.master.alive is False
+        assert knowledge.master.alive is False
         assert pool.spec.on_lost == "Delete"
 
 
 def creation_never_passes_what_is_wanted(
-    made: Plan, pool: FiberPool, pods: list[PodView], memory: Memory
+    made: Plan, pool: FiberPool, pods: list[PodView], knowledge: Knowledge
 ) -> None:
     gone = {deletion.name for deletion in made.delete}
     live = [pod for pod in own(pool, pods).values() if pod.live and pod.name not in gone]
@@ -184,7 +183,7 @@ def creation_never_passes_what_is_wanted(
 
 
 def nothing_is_created_where_something_forbids_it(
-    made: Plan, pool: FiberPool, pods: list[PodView], memory: Memory
+    made: Plan, pool: FiberPool, pods: list[PodView], knowledge: Knowledge
 ) -> None:
     if not made.create:
         return
@@ -194,17 +193,17 @@ def nothing_is_created_where_something_forbids_it(
         gone = {deletion.name for deletion in made.delete}
         live = [pod for pod in own(pool, pods).values() if pod.live and pod.name not in gone]
         assert len(live) + made.create + failures.waiting <= pool.wanted
-    assert memory.address
-    assert not memory.obstacles
-    assert not memory.refusal
+    assert knowledge.address
+    assert not knowledge.obstacles
+    assert not knowledge.refusal
     assert not pool.spec.suspend
     assert not made.dry_run
     proven = after(pool, made).status.proven_template_hash
-    assert template_hash(pool) in (memory.accepted, proven)
+    assert template_hash(pool) in (knowledge.accepted, proven)
 
 
 def a_template_that_never_worked_gets_few_pods(
-    made: Plan, pool: FiberPool, pods: list[PodView], memory: Memory
+    made: Plan, pool: FiberPool, pods: list[PodView], knowledge: Knowledge
 ) -> None:
     status, hash_ = after(pool, made).status, template_hash(pool)
     if not made.create or status.proven_template_hash == hash_:
@@ -225,17 +224,17 @@ def a_template_that_never_worked_gets_few_pods(
 
 
 def the_order_of_the_list_makes_no_difference(
-    made: Plan, pool: FiberPool, pods: list[PodView], memory: Memory
+    made: Plan, pool: FiberPool, pods: list[PodView], knowledge: Knowledge
 ) -> None:
-    assert plan(pool, pods[::-1], memory, NOW) == made
-    assert plan(pool, sorted(pods, key=lambda pod: pod.resource_version), memory, NOW) == made
+    assert plan(pool, pods[::-1], knowledge, NOW) == made
+    assert plan(pool, sorted(pods, key=lambda pod: pod.resource_version), knowledge, NOW) == made
 
 
 def a_plan_whose_status_is_written_stays_the_plan(
-    made: Plan, pool: FiberPool, pods: list[PodView], memory: Memory
+    made: Plan, pool: FiberPool, pods: list[PodView], knowledge: Knowledge
 ) -> None:
     """The operator died after writing the status: the next one does the rest."""
-    second = plan(after(pool, made), pods, memory, NOW)
+    second = plan(after(pool, made), pods, knowledge, NOW)
     if made.status is None and not made.dry_run:
         assert second == made
     else:
@@ -244,12 +243,12 @@ def a_plan_whose_status_is_written_stays_the_plan(
 
 
 def nothing_is_planned_twice(
-    made: Plan, pool: FiberPool, pods: list[PodView], memory: Memory
+    made: Plan, pool: FiberPool, pods: list[PodView], knowledge: Knowledge
 ) -> None:
     model = Model(
         document=pool.model_dump(mode="json", by_alias=True),
         pods={pod.name: pod for pod in pods},
-        memory=memory,
+        knowledge=knowledge,
     )
     model.act()
     if made.dry_run or made.delete_pool:
@@ -286,15 +285,15 @@ def at_work(spec: dict[str, Any]) -> dict[str, Any]:
 
 @given(cases(SPECS.map(at_work)))
 def test_a_ready_worker_of_a_master_goes_only_when_released(case: Case) -> None:
-    pool, pods, memory = case
+    pool, pods, knowledge = case
     spec = pool.spec
-    made = plan(pool, pods, memory, NOW)
+    made = plan(pool, pods, knowledge, NOW)
     known = own(pool, pods)
     for deletion in made.delete:
         pod = known[deletion.name]
         if pod.live and pod.name not in spec.scale_down.release:
             late = deletion.reason == Reason.STARTUP_TIMEOUT
-            assert pod.state is (State.STARTING if late else State.PENDING)
+            assert pod.state is (PodState.STARTING if late else PodState.PENDING)
             assert deletion.resource_version == pod.resource_version
     assert not made.delete_pool
 
@@ -303,12 +302,12 @@ def test_a_ready_worker_of_a_master_goes_only_when_released(case: Case) -> None:
 @settings(max_examples=30, deadline=None, phases=NO_SHRINKING)
 @given(cases())
 def test_every_state_settles(case: Case) -> None:
-    pool, pods, memory = case
+    pool, pods, knowledge = case
     assume(not (pool.spec.master and pool.spec.master.lease_name))
     model = Model(
         document=pool.model_dump(mode="json", by_alias=True),
         pods={pod.name: pod for pod in pods},
-        memory=replace(memory, address=ADDRESS, obstacles=(), refusal=None),
+        knowledge=replace(knowledge, address=ADDRESS, obstacles=(), refusal=None),
     )
     model.document["spec"]["suspend"] = False
     if model.plan().status and model.pool.status.failures.consecutive > 6:
@@ -326,7 +325,7 @@ def test_every_state_settles(case: Case) -> None:
     forgotten = pool.spec.idle and pool.spec.master and not pool.spec.replicas
     wanted = 0 if forgotten else pool.wanted
     assert len(mine) == wanted
-    assert all(pod.state is State.READY for pod in mine)
+    assert all(pod.state is PodState.READY for pod in mine)
     status = model.pool.status
     assert (status.ready_replicas, status.desired_replicas) == (wanted, wanted)
     if pool.spec.update.strategy != "OnDelete":
@@ -355,7 +354,7 @@ def test_each_end_is_counted_once_though_the_operator_dies(
         if kill:
             model.restart()
         model.pass_time()
-        failed |= {pod.name for pod in model.pods.values() if pod.state is State.ENDED}
+        failed |= {pod.name for pod in model.pods.values() if pod.state is PodState.ENDED}
     model.write_status(model.plan())
     assert model.pool.status.failures.total == len(failed)
 
@@ -467,10 +466,10 @@ def test_workers_that_end_well_for_ever_come_back_ever_more_slowly(replicas: int
 def test_junk_in_the_status_is_written_over(junk: Any, fields: dict[str, Any]) -> None:
     for status in (junk, fields, {"failures": fields}, {"conditions": [fields]}):
         pool = FiberPool.read({**pool_document(replicas=2), "status": status})
-        memory = Memory(address=ADDRESS, accepted=template_hash(pool))
-        made = plan(pool, [], memory, NOW)
+        knowledge = Knowledge(address=ADDRESS, accepted=template_hash(pool))
+        made = plan(pool, [], knowledge, NOW)
         assert made.status is not None
-        again = plan(after(pool, made), [], memory, NOW)
+        again = plan(after(pool, made), [], knowledge, NOW)
         assert again.status is None
 
 
@@ -482,14 +481,14 @@ def test_junk_in_the_status_is_written_over(junk: Any, fields: dict[str, Any]) -
 def test_junk_in_the_spec_deletes_nothing(key: str, field: str, junk: Any) -> None:
     document = pool_document(replicas=2)
     document[key][field] = junk
-    pods = [view(number, State.READY) for number in range(4)]
+    pods = [view(number, PodState.READY) for number in range(4)]
     errors: tuple[str, ...] = ()
     try:
         pool = FiberPool.read(document)
     except InvalidPool as error:
         errors = error.errors
     if not errors:
-        plan(pool, pods, Memory(address=ADDRESS), NOW)
+        plan(pool, pods, Knowledge(address=ADDRESS), NOW)
         return
     made = plan_unreadable(document, pods, errors, NOW)
     assert (made.create, made.delete) == (0, ())

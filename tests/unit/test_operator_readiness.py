@@ -15,7 +15,7 @@ from fiber_api.times import format_time
 from fiber_api.v1alpha1 import FiberPool
 from fiber_operator.metrics import PoolSample
 from fiber_operator.planning import plans
-from fiber_operator.planning.pods import State, observe
+from fiber_operator.planning.pods import PodState, observe
 from fiber_operator.planning.podspec import pod
 from patience import PATIENCE
 from unit.operator_objects import (
@@ -115,7 +115,7 @@ def test_the_probe_ends_when_the_file_is_there(tmp_path: Path) -> None:
 
 def test_a_pod_that_is_not_linked_counts_as_one_that_runs() -> None:
     found = observe(joining(age=50), "worker")
-    assert (found.state, found.joining, found.was_ready) == (State.READY, True, True)
+    assert (found.state, found.joining, found.was_ready) == (PodState.READY, True, True)
     assert found.since == NOW - 49
     assert not found.trouble
 
@@ -131,19 +131,19 @@ def test_a_pod_that_is_not_linked_counts_as_one_that_runs() -> None:
 )
 def test_what_else_keeps_a_pod_from_ready_does(document: Json) -> None:
     found = observe(document, "worker")
-    assert (found.state, found.joining) == (State.STARTING, False)
+    assert (found.state, found.joining) == (PodState.STARTING, False)
 
 
 def test_another_container_that_is_not_ready_does() -> None:
     document = joining()
     other = {"name": "proxy", "ready": False, "state": {"running": {}}}
     document["status"]["containerStatuses"].append(other)
-    assert observe(document, "worker").state is State.STARTING
+    assert observe(document, "worker").state is PodState.STARTING
 
 
 def test_a_deleted_pod_is_not_joining() -> None:
     found = observe(terminating(joining()), "worker")
-    assert (found.state, found.joining) == (State.TERMINATING, False)
+    assert (found.state, found.joining) == (PodState.TERMINATING, False)
 
 
 def test_a_pool_is_ready_when_its_workers_are_linked() -> None:

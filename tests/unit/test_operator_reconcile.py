@@ -13,10 +13,10 @@ from fiber_api.names import Reason
 from fiber_api.times import format_time
 from fiber_api.v1alpha1 import FiberPool
 from fiber_operator.planning import plans
-from fiber_operator.planning.plans import Memory, Plan, Refusal
-from fiber_operator.planning.pods import State, Trouble
+from fiber_operator.planning.manifests import spec_hash, template_hash
+from fiber_operator.planning.plans import Knowledge, Plan, PodRefusal
+from fiber_operator.planning.pods import PodState, Trouble
 from fiber_operator.planning.reconcile import plan
-from fiber_operator.planning.revisions import spec_hash, template_hash
 from unit.operator_cluster_model import view
 from unit.operator_objects import (
     MASTER,
@@ -24,8 +24,8 @@ from unit.operator_objects import (
     UID,
     condition,
     ended,
+    knowledge_of,
     make_pool,
-    memory_of,
     name_of,
     of_template,
     plan_of,
@@ -115,13 +115,13 @@ def test_nothing_is_created_without_an_address_or_with_an_obstacle() -> None:
 
 def test_a_refusal_is_tried_again_after_a_while() -> None:
     pool = tried(replicas=3)
-    refused = Refusal(template_hash(pool), 403, "exceeded quota: q", NOW, count=4)
+    refused = PodRefusal(template_hash(pool), 403, "exceeded quota: q", NOW, count=4)
     first = plan_of(pool, refusal=refused)
     assert first.create == 0
     assert first.requeue_at is not None
     assert NOW + 25 < first.requeue_at <= NOW + 30
     assert plan_of(pool, refusal=refused, now=NOW + 31).create == 3
-    other = Refusal("an older template", 422, "no", NOW)
+    other = PodRefusal("an older template", 422, "no", NOW)
     assert plan_of(pool, refusal=other).create == 3
 
 
@@ -233,7 +233,7 @@ def test_on_idle_leaves_ready_workers_to_their_master() -> None:
 def test_a_worker_whose_template_nobody_can_tell_is_not_outdated() -> None:
     pool = tried(replicas=1)
     (worker,) = views(pool, running(1))
-    made = plan(pool, [replace(worker, template_hash="")], memory_of(pool), NOW)
+    made = plan(pool, [replace(worker, template_hash="")], knowledge_of(pool), NOW)
     assert made.delete == ()
     assert with_plan(pool, made).status.updated_replicas == 1
 
@@ -266,7 +266,7 @@ def test_a_template_that_is_refused_replaces_nothing(strategy: str) -> None:
     pool = make_pool(replicas=2, update={"strategy": strategy})
     old = outdated(running(1), pod_document(2))
     assert plan_of(pool, *old, accepted=None).delete == ()
-    refused = Refusal(template_hash(pool), 422, "spec.containers[0].image: Required value", NOW)
+    refused = PodRefusal(template_hash(pool), 422, "spec.containers[0].image: Required value", NOW)
     made = plan_of(pool, *old, accepted=None, refusal=refused)
     assert (made.delete, made.dry_run) == ((), False)
     status = with_plan(pool, made).status
@@ -338,7 +338,7 @@ def test_what_a_quota_or_the_nodes_keep_out_says_nothing_of_those_that_work() ->
     homeless = [unschedulable(number) for number in range(5, 11)]
     made = with_plan(pool, plan_of(pool, *ready, ended(4), *homeless))
     assert made.status.failures.consecutive == 0
-    refused = Refusal(template_hash(pool), 403, "exceeded quota: q", NOW - 1)
+    refused = PodRefusal(template_hash(pool), 403, "exceeded quota: q", NOW - 1)
     made = with_plan(pool, plan_of(pool, *ready, ended(4), refusal=refused))
     assert made.status.failures.consecutive == 0
     assert with_plan(pool, plan_of(pool, *ready, ended(4))).status.failures.consecutive == 7
@@ -350,18 +350,18 @@ def with_replicas(pool: FiberPool, replicas: int) -> FiberPool:
 
 def test_a_status_stays_small_whatever_happens_to_how_many() -> None:
     pool = tried(replicas=6000, maxReplicas=6000)
-    workers = [view(number, State.READY, template_hash="older") for number in range(6000)]
-    memory = memory_of(pool)
+    workers = [view(number, PodState.READY, template_hash="older") for number in range(6000)]
+    knowledge = knowledge_of(pool)
     for pods in (
         workers,
-        [replace(pod, state=State.TERMINATING) for pod in workers],
+        [replace(pod, state=PodState.TERMINATING) for pod in workers],
         [
-            replace(pod, state=State.ENDED, trouble=Trouble.APPLICATION, message="x" * 1000)
+            replace(pod, state=PodState.ENDED, trouble=Trouble.APPLICATION, message="x" * 1000)
             for pod in workers
         ],
     ):
         for spec in (pool.spec, pool.spec.model_copy(update={"suspend": True})):
-            made = plan(pool.model_copy(update={"spec": spec}), pods, memory, NOW)
+            made = plan(pool.model_copy(update={"spec": spec}), pods, knowledge, NOW)
             assert made.status is not None
             assert len(json.dumps(made.status)) < 40_000
 
@@ -548,5 +548,5 @@ def test_a_settled_pool_is_left_alone() -> None:
     assert plan_of(settled, *pods, now=NOW + 3600) == Plan(
         batch_limit=200, template_hash=template_hash(pool)
     )
-    assert plan(settled, views(pool, *pods), Memory(), NOW).status is None
+    assert plan(settled, views(pool, *pods), Knowledge(), NOW).status is None
     assert settled.metadata.uid == UID

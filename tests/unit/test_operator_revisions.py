@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from fiber_operator.planning.revisions import spec_hash, template_hash
+from fiber_operator.planning.manifests import spec_hash, template_hash
 from unit.operator_objects import MASTER, make_pool
 
 TEMPLATE = {

@@ -11,11 +11,11 @@ import pytest
 from fakes import virtual_time
 from fakes.kubernetes_api import Fault
 from fakes.world import NAMESPACE, World, a_world
-from fiber_operator.program import Program
+from fiber_operator.process import OperatorProcess
 
 
 @contextlib.asynccontextmanager
-async def another_release(world: World) -> AsyncIterator[Program]:
+async def another_release(world: World) -> AsyncIterator[OperatorProcess]:
     program = world.another(
         host="127.0.0.1", port=0, identity="other-1", namespace="other-system", lease="other"
     )

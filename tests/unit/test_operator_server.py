@@ -23,9 +23,9 @@ from fakes.kubernetes_api import Fault
 from fakes.world import NAMESPACE, OWN_LEASE, Test, World, a_world
 from fiber_operator.health import Health
 from fiber_operator.metrics import Metrics, PoolSample
-from fiber_operator.planning.pods import State
-from fiber_operator.watches import Watches
-from fiber_operator.workqueue import Statistics
+from fiber_operator.planning.pods import PodState
+from fiber_operator.watches import WatchStatus
+from fiber_operator.workqueue import QueueStatistics
 from patience import PATIENCE
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -112,11 +112,11 @@ class Parts:
     def __init__(self, **statistics: float) -> None:
         self.now = 10_000.0
         well = {"waiting": 0, "running": 0, "known": 1, "longest_wait": 0.0, "longest_run": 0.0}
-        found = Statistics(**{**well, "since_last_end": 5.0, **statistics})  # type: ignore[arg-type]
+        found = QueueStatistics(**{**well, "since_last_end": 5.0, **statistics})  # type: ignore[arg-type]
         self.resync = SimpleNamespace(
             seconds=60.0, failures={}, tried=self.now - 30, succeeded=self.now - 30
         )
-        self.watches = Watches(())
+        self.watches = WatchStatus(())
         self.watches.started(True)
         self.watches.answered("watch fiberpools", None)
         self.watches.answered("watch pods", None)
@@ -223,7 +223,7 @@ def test_what_the_chart_asks_for_is_what_there_is() -> None:
 
 
 def test_states_of_pods_are_labels() -> None:
-    assert [state.value.lower() for state in State] == [
+    assert [state.value.lower() for state in PodState] == [
         "pending",
         "starting",
         "ready",

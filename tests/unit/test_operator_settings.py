@@ -11,13 +11,13 @@ from pathlib import Path
 import pytest
 
 from fiber_operator import logs
-from fiber_operator.settings import Settings, SettingsError
+from fiber_operator.settings import OperatorSettings, SettingsError
 
 NOWHERE = Path("/nowhere/namespace")
 
 
-def read(**environment: str) -> Settings:
-    return Settings.from_environment(
+def read(**environment: str) -> OperatorSettings:
+    return OperatorSettings.from_environment(
         {f"FIBER_OPERATOR_{name}": value for name, value in environment.items()}, NOWHERE
     )
 
@@ -45,7 +45,7 @@ def test_everything_can_be_set() -> None:
         LOG_LEVEL="debug",
         LOG_FORMAT="TEXT",
     )
-    assert settings == Settings(
+    assert settings == OperatorSettings(
         namespaces=("one", "two"),
         namespace="fiber-system",
         identity="pod-1",
@@ -119,9 +119,9 @@ def test_what_kubernetes_says_of_services_is_no_setting(name: str) -> None:
 def test_the_pods_own_namespace_is_where_the_lease_is(tmp_path: Path) -> None:
     file = tmp_path / "namespace"
     file.write_text("fiber-system\n")
-    assert Settings.from_environment({}, file).namespace == "fiber-system"
+    assert OperatorSettings.from_environment({}, file).namespace == "fiber-system"
     given = {"FIBER_OPERATOR_NAMESPACE": "other"}
-    assert Settings.from_environment(given, file).namespace == "other"
+    assert OperatorSettings.from_environment(given, file).namespace == "other"
 
 
 # -- Log lines

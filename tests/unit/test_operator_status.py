@@ -8,9 +8,9 @@ import pytest
 
 from fiber_api.v1alpha1 import FiberPool, FiberPoolStatus
 from fiber_operator.planning import plans
-from fiber_operator.planning.pods import State
+from fiber_operator.planning.manifests import template_hash
+from fiber_operator.planning.pods import PodState
 from fiber_operator.planning.reconcile import plan_unreadable
-from fiber_operator.planning.revisions import template_hash
 from unit.operator_cluster_model import view
 from unit.operator_objects import (
     MASTER,
@@ -213,7 +213,7 @@ def test_a_spec_that_cannot_be_read_is_told_and_counts_go_on() -> None:
         with_plan(pool, plan_of(pool, running(1))).status.model_dump(mode="json", by_alias=True)
     )
     document["spec"]["replicas"] = "three"
-    pods = [*views(pool, running(1)), view(2, State.PENDING)]
+    pods = [*views(pool, running(1)), view(2, PodState.PENDING)]
     made = plan_unreadable(document, pods, ["spec.replicas: Input should be an integer"], NOW)
     assert made.status is not None
     status = FiberPoolStatus.model_validate(made.status)

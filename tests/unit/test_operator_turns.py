@@ -5,20 +5,21 @@ from __future__ import annotations
 import asyncio
 
 from fakes import virtual_time
-from fiber_operator.turns import Turns, in_turn
+from fiber_operator.cluster import NamespaceSemaphore
+from fiber_operator.lease_monitor import in_turn
 from fiber_operator.workqueue import Key
 
 
 def test_one_namespace_does_not_make_another_wait_for_all_its_calls() -> None:
     begun: list[str] = []
 
-    async def call(turns: Turns, namespace: str) -> None:
+    async def call(turns: NamespaceSemaphore, namespace: str) -> None:
         async with turns.take(namespace):
             begun.append(namespace)
             await asyncio.sleep(1)
 
     async def main() -> None:
-        turns = Turns(2)
+        turns = NamespaceSemaphore(2)
         calls = [asyncio.create_task(call(turns, "flood")) for _ in range(100)]
         await asyncio.sleep(0.5)
         calls += [asyncio.create_task(call(turns, name)) for name in ("a", "b", "a")]
@@ -30,12 +31,12 @@ def test_one_namespace_does_not_make_another_wait_for_all_its_calls() -> None:
 
 
 def test_a_call_that_is_cancelled_gives_its_place_to_another() -> None:
-    async def hold(turns: Turns, released: asyncio.Event) -> None:
+    async def hold(turns: NamespaceSemaphore, released: asyncio.Event) -> None:
         async with turns.take("a"):
             await released.wait()
 
     async def main() -> None:
-        turns, released = Turns(1), asyncio.Event()
+        turns, released = NamespaceSemaphore(1), asyncio.Event()
         first, second, third = (asyncio.create_task(hold(turns, released)) for _ in range(3))
         await asyncio.sleep(0)
         first.cancel()

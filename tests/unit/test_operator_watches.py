@@ -10,18 +10,19 @@ import pytest
 
 from fakes.kubernetes_api import Fault
 from fakes.world import World, a_world, configuration
-from fiber_operator.cluster import Configuration, Refused, Unavailable
-from fiber_operator.program import Program
-from fiber_operator.settings import Settings
-from fiber_operator.watches import Watches
+from fiber_operator.cluster import Configuration
+from fiber_operator.process import OperatorProcess
+from fiber_operator.responses import Refused, Unavailable
+from fiber_operator.settings import OperatorSettings
+from fiber_operator.watches import WatchStatus
 from patience import PATIENCE
 
 SAID = 'pods is forbidden: User "operator" cannot watch resource "pods" at the cluster scope'
 REFUSED = Refused(SAID, what="watch pods", status=403, reason="Forbidden")
 
 
-def all_well(*namespaces: str) -> Watches:
-    watches = Watches(namespaces)
+def all_well(*namespaces: str) -> WatchStatus:
+    watches = WatchStatus(namespaces)
     watches.started(True)
     for where in [f" in {namespace}" for namespace in namespaces] or [""]:
         for plural in ("fiberpools", "pods", "leases"):
@@ -35,7 +36,7 @@ def test_watches_that_are_open_are_well() -> None:
 
 
 def test_each_watch_must_have_begun() -> None:
-    watches = Watches(["one"])
+    watches = WatchStatus(["one"])
     assert watches.wrong() == ["nothing is watched: changes are seen late"]
     watches.started(True)
     watches.answered("list pods in one", None)
@@ -87,8 +88,8 @@ def test_an_operator_that_must_not_watch_pods_is_not_ready(verb: str) -> None:
             async def configure() -> Configuration:
                 return configuration(world.api)
 
-            settings = Settings(host="127.0.0.1", port=0, identity="operator-1")
-            program = Program(settings, configure=configure, now=world.store.unix_now)
+            settings = OperatorSettings(host="127.0.0.1", port=0, identity="operator-1")
+            program = OperatorProcess(settings, configure=configure, now=world.store.unix_now)
             task = asyncio.ensure_future(program.run(stop))
             said = f"changes are not seen: {verb} pods: {message}. Give the operator's account"
             await until(world, program, said)
@@ -102,13 +103,13 @@ def test_an_operator_that_must_not_watch_pods_is_not_ready(verb: str) -> None:
     asyncio.run(main())
 
 
-async def ask(program: Program) -> tuple[int, str]:
+async def ask(program: OperatorProcess) -> tuple[int, str]:
     url = f"http://127.0.0.1:{program.port}/readyz"
     async with aiohttp.ClientSession() as session, session.get(url) as response:
         return response.status, await response.text()
 
 
-async def until(world: World, program: Program, said: str) -> None:
+async def until(world: World, program: OperatorProcess, said: str) -> None:
     """Wait until /readyz says so."""
     await world.until(lambda: bool(program.port), within=10)
     async with asyncio.timeout(PATIENCE):

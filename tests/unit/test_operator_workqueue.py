@@ -17,8 +17,8 @@ from fiber_operator.workqueue import (
     LONGEST_BACKOFF,
     LULL,
     Key,
-    Queue,
     Result,
+    WorkQueue,
 )
 
 A, B = Key("team", "a"), Key("team", "b")
@@ -48,9 +48,9 @@ class Reconciler:
 
 
 @contextlib.asynccontextmanager
-async def a_queue(concurrency: int = 8) -> AsyncIterator[tuple[Queue, Reconciler]]:
+async def a_queue(concurrency: int = 8) -> AsyncIterator[tuple[WorkQueue, Reconciler]]:
     reconciler = Reconciler()
-    queue = Queue(reconciler, concurrency=concurrency)
+    queue = WorkQueue(reconciler, concurrency=concurrency)
     task = asyncio.ensure_future(queue.run())
     try:
         yield queue, reconciler
@@ -59,7 +59,7 @@ async def a_queue(concurrency: int = 8) -> AsyncIterator[tuple[Queue, Reconciler
         await asyncio.wait([task])
 
 
-Test = Callable[[Queue, Reconciler], Coroutine[Any, Any, None]]
+Test = Callable[[WorkQueue, Reconciler], Coroutine[Any, Any, None]]
 
 
 def played(concurrency: int = 8) -> Callable[[Test], Callable[[], None]]:
@@ -74,14 +74,18 @@ def played(concurrency: int = 8) -> Callable[[Test], Callable[[], None]]:
 
 
 @played()
-async def test_what_is_added_is_reconciled_at_once(queue: Queue, reconciler: Reconciler) -> None:
+async def test_what_is_added_is_reconciled_at_once(
+    queue: WorkQueue, reconciler: Reconciler
+) -> None:
     queue.add(A)
     await asyncio.sleep(10)
     assert reconciler.begun == [(0.0, A)]
 
 
 @played()
-async def test_a_thousand_additions_are_one_reconcile(queue: Queue, reconciler: Reconciler) -> None:
+async def test_a_thousand_additions_are_one_reconcile(
+    queue: WorkQueue, reconciler: Reconciler
+) -> None:
     for _ in range(1000):
         queue.add(A)
     await asyncio.sleep(10)
@@ -89,7 +93,9 @@ async def test_a_thousand_additions_are_one_reconcile(queue: Queue, reconciler: 
 
 
 @played()
-async def test_additions_during_a_turn_are_one_more(queue: Queue, reconciler: Reconciler) -> None:
+async def test_additions_during_a_turn_are_one_more(
+    queue: WorkQueue, reconciler: Reconciler
+) -> None:
     reconciler.lasts = 3.0
     queue.add(A)
     await asyncio.sleep(1)
@@ -102,7 +108,7 @@ async def test_additions_during_a_turn_are_one_more(queue: Queue, reconciler: Re
 
 @played()
 async def test_events_wait_for_the_gap_and_urgent_ones_do_not(
-    queue: Queue, reconciler: Reconciler
+    queue: WorkQueue, reconciler: Reconciler
 ) -> None:
     queue.add(A)
     await asyncio.sleep(0.1)
@@ -118,7 +124,7 @@ async def test_events_wait_for_the_gap_and_urgent_ones_do_not(
 
 @played()
 async def test_urgent_ones_during_a_turn_follow_at_once(
-    queue: Queue, reconciler: Reconciler
+    queue: WorkQueue, reconciler: Reconciler
 ) -> None:
     reconciler.lasts = 2.0
     queue.add(A)
@@ -129,7 +135,7 @@ async def test_urgent_ones_during_a_turn_follow_at_once(
 
 
 @played()
-async def test_a_pool_rests_whatever_happens(queue: Queue, reconciler: Reconciler) -> None:
+async def test_a_pool_rests_whatever_happens(queue: WorkQueue, reconciler: Reconciler) -> None:
     reconciler.result = Result(rest=4.0)
     queue.add(A)
     await asyncio.sleep(1)
@@ -139,7 +145,7 @@ async def test_a_pool_rests_whatever_happens(queue: Queue, reconciler: Reconcile
 
 
 @played()
-async def test_a_lull_ends_a_rest(queue: Queue, reconciler: Reconciler) -> None:
+async def test_a_lull_ends_a_rest(queue: WorkQueue, reconciler: Reconciler) -> None:
     reconciler.result = Result(rest=4.0, lull=True)
     queue.add(A)
     await asyncio.sleep(1)
@@ -151,7 +157,7 @@ async def test_a_lull_ends_a_rest(queue: Queue, reconciler: Reconciler) -> None:
 
 
 @played()
-async def test_what_a_rest_lacked_is_made_up_for(queue: Queue, reconciler: Reconciler) -> None:
+async def test_what_a_rest_lacked_is_made_up_for(queue: WorkQueue, reconciler: Reconciler) -> None:
     reconciler.result = Result(rest=4.0, lull=True)
     queue.add(A)
     await asyncio.sleep(1)
@@ -163,7 +169,9 @@ async def test_what_a_rest_lacked_is_made_up_for(queue: Queue, reconciler: Recon
 
 
 @played()
-async def test_while_events_do_not_cease_a_pool_rests(queue: Queue, reconciler: Reconciler) -> None:
+async def test_while_events_do_not_cease_a_pool_rests(
+    queue: WorkQueue, reconciler: Reconciler
+) -> None:
     reconciler.result = Result(rest=4.0, lull=True)
     queue.add(A)
     for _ in range(90):
@@ -174,7 +182,7 @@ async def test_while_events_do_not_cease_a_pool_rests(queue: Queue, reconciler: 
 
 @played()
 async def test_no_lull_brings_a_failed_pool_back_early(
-    queue: Queue, reconciler: Reconciler
+    queue: WorkQueue, reconciler: Reconciler
 ) -> None:
     reconciler.result = Result(failed=True, rest=4.0, lull=True)
     queue.add(A)
@@ -185,7 +193,7 @@ async def test_no_lull_brings_a_failed_pool_back_early(
 
 
 @played()
-async def test_a_turn_may_ask_for_another(queue: Queue, reconciler: Reconciler) -> None:
+async def test_a_turn_may_ask_for_another(queue: WorkQueue, reconciler: Reconciler) -> None:
     reconciler.result = Result(requeue_after=7.0)
     queue.add(A)
     await asyncio.sleep(20)
@@ -193,7 +201,7 @@ async def test_a_turn_may_ask_for_another(queue: Queue, reconciler: Reconciler) 
 
 
 @played()
-async def test_the_earlier_wish_wins(queue: Queue, reconciler: Reconciler) -> None:
+async def test_the_earlier_wish_wins(queue: WorkQueue, reconciler: Reconciler) -> None:
     queue.add(A, delay=100)
     queue.add(A, delay=5)
     queue.add(A, delay=50)
@@ -204,7 +212,7 @@ async def test_the_earlier_wish_wins(queue: Queue, reconciler: Reconciler) -> No
 @pytest.mark.parametrize("result", [Result(failed=True), RuntimeError("a fault of ours")], ids=str)
 def test_failures_are_repeated_later_each_time(result: Result | Exception) -> None:
     @played()
-    async def test(queue: Queue, reconciler: Reconciler) -> None:
+    async def test(queue: WorkQueue, reconciler: Reconciler) -> None:
         reconciler.result = result
         queue.add(A)
         await asyncio.sleep(119)
@@ -221,7 +229,7 @@ def test_failures_are_repeated_later_each_time(result: Result | Exception) -> No
 
 @played()
 async def test_an_event_shortens_the_wait_after_a_failure(
-    queue: Queue, reconciler: Reconciler
+    queue: WorkQueue, reconciler: Reconciler
 ) -> None:
     reconciler.result = Result(failed=True)
     queue.add(A)
@@ -236,7 +244,9 @@ async def test_an_event_shortens_the_wait_after_a_failure(
 
 
 @played()
-async def test_a_server_that_asks_to_wait_is_obeyed(queue: Queue, reconciler: Reconciler) -> None:
+async def test_a_server_that_asks_to_wait_is_obeyed(
+    queue: WorkQueue, reconciler: Reconciler
+) -> None:
     reconciler.result = Result(failed=True, rest=20.0)
     queue.add(A)
     await asyncio.sleep(1)
@@ -246,7 +256,7 @@ async def test_a_server_that_asks_to_wait_is_obeyed(queue: Queue, reconciler: Re
 
 
 @played(concurrency=2)
-async def test_pools_take_turns_side_by_side(queue: Queue, reconciler: Reconciler) -> None:
+async def test_pools_take_turns_side_by_side(queue: WorkQueue, reconciler: Reconciler) -> None:
     reconciler.lasts = 1.0
     for number in range(6):
         queue.add(Key("team", str(number)))
@@ -267,7 +277,7 @@ class Trouble(Reconciler):
         return Result(failed=bad)
 
 
-async def in_trouble(queue: Queue, pools: int, since: float) -> None:
+async def in_trouble(queue: WorkQueue, pools: int, since: float) -> None:
     for number in range(pools):
         queue.add(Key("bad", str(number)))
     await asyncio.sleep(since)
@@ -278,7 +288,7 @@ async def in_trouble(queue: Queue, pools: int, since: float) -> None:
 def test_pools_in_trouble_do_not_hold_up_the_others(pools: int, since: float) -> None:
     async def main() -> None:
         reconciler = Trouble()
-        queue = Queue(reconciler, concurrency=8)
+        queue = WorkQueue(reconciler, concurrency=8)
         task = asyncio.ensure_future(queue.run())
         await in_trouble(queue, pools, since)
         added = asyncio.get_running_loop().time()
@@ -294,7 +304,9 @@ def test_pools_in_trouble_do_not_hold_up_the_others(pools: int, since: float) ->
 
 
 @played(concurrency=1)
-async def test_who_fails_is_not_forgotten_over_others(queue: Queue, reconciler: Reconciler) -> None:
+async def test_who_fails_is_not_forgotten_over_others(
+    queue: WorkQueue, reconciler: Reconciler
+) -> None:
     reconciler.result = Result(failed=True)
     queue.add(A)
     await asyncio.sleep(0.1)
@@ -312,7 +324,7 @@ async def test_who_fails_is_not_forgotten_over_others(queue: Queue, reconciler: 
 
 @played(concurrency=2)
 async def test_a_turn_that_lasts_hands_its_place_on_to_so_many(
-    queue: Queue, reconciler: Reconciler
+    queue: WorkQueue, reconciler: Reconciler
 ) -> None:
     reconciler.lasts = 100.0
     for number in range(20):
@@ -323,7 +335,7 @@ async def test_a_turn_that_lasts_hands_its_place_on_to_so_many(
 
 
 @played()
-async def test_a_pool_that_is_gone_is_forgotten(queue: Queue, reconciler: Reconciler) -> None:
+async def test_a_pool_that_is_gone_is_forgotten(queue: WorkQueue, reconciler: Reconciler) -> None:
     reconciler.result = Result(forget=True)
     queue.add(A)
     await asyncio.sleep(1)
@@ -332,7 +344,7 @@ async def test_a_pool_that_is_gone_is_forgotten(queue: Queue, reconciler: Reconc
 
 @played()
 async def test_a_pool_made_again_meanwhile_is_not_forgotten(
-    queue: Queue, reconciler: Reconciler
+    queue: WorkQueue, reconciler: Reconciler
 ) -> None:
     reconciler.result, reconciler.lasts = Result(forget=True), 1.0
     queue.add(A)
@@ -345,7 +357,9 @@ async def test_a_pool_made_again_meanwhile_is_not_forgotten(
 
 
 @played()
-async def test_statistics_tell_what_waits_and_runs(queue: Queue, reconciler: Reconciler) -> None:
+async def test_statistics_tell_what_waits_and_runs(
+    queue: WorkQueue, reconciler: Reconciler
+) -> None:
     reconciler.lasts = 100.0
     queue.add(A)
     queue.add(B, delay=50)
@@ -358,7 +372,7 @@ async def test_statistics_tell_what_waits_and_runs(queue: Queue, reconciler: Rec
 
 @played()
 async def test_draining_waits_for_turns_and_begins_none(
-    queue: Queue, reconciler: Reconciler
+    queue: WorkQueue, reconciler: Reconciler
 ) -> None:
     reconciler.lasts = 2.0
     queue.add(A)
@@ -372,7 +386,7 @@ async def test_draining_waits_for_turns_and_begins_none(
 
 
 @played()
-async def test_draining_does_not_wait_for_ever(queue: Queue, reconciler: Reconciler) -> None:
+async def test_draining_does_not_wait_for_ever(queue: WorkQueue, reconciler: Reconciler) -> None:
     reconciler.lasts = 1000.0
     queue.add(A)
     await asyncio.sleep(1)
@@ -382,7 +396,7 @@ async def test_draining_does_not_wait_for_ever(queue: Queue, reconciler: Reconci
 
 @played()
 async def test_an_end_in_the_middle_of_a_turn_leaves_nothing(
-    queue: Queue, reconciler: Reconciler
+    queue: WorkQueue, reconciler: Reconciler
 ) -> None:
     reconciler.lasts = 1000.0
     queue.add(A)
@@ -412,7 +426,7 @@ def test_the_pools_of_one_namespace_do_not_delay_those_of_another(
     async def main() -> None:
         reconciler = Flood()
         reconciler.result = result
-        queue = Queue(reconciler, concurrency=concurrency)
+        queue = WorkQueue(reconciler, concurrency=concurrency)
         task = asyncio.ensure_future(queue.run())
         for number in range(1000):
             queue.add(Key("flood", str(number)), urgent=True)
@@ -431,7 +445,7 @@ def test_the_pools_of_one_namespace_do_not_delay_those_of_another(
 
 
 @played(concurrency=2)
-async def test_namespaces_take_turns(queue: Queue, reconciler: Reconciler) -> None:
+async def test_namespaces_take_turns(queue: WorkQueue, reconciler: Reconciler) -> None:
     reconciler.lasts = 1.0
     for name in "ab":
         for number in range(4):

@@ -1,5 +1,5 @@
-"""Decisions of the operator: pure functions from the state to the work to do.
+"""Decisions of the operator: pure functions from what was seen to the work to do.
 
-``reconcile.plan`` is the whole of it.  No clock, no thread, no socket, no client: ``now`` and all
-that was seen are arguments, and what comes out is a ``plans.Plan`` that the controller carries out.
+``reconcile.plan`` makes a ``plans.Plan``, which the controller carries out.  The modules use no
+clock, thread, socket or client: the time and all observations are arguments.
 """

@@ -1,4 +1,4 @@
-"""Reading JSON that may hold anything: each function returns a value of its type, never raises."""
+"""Readers of JSON that may hold anything: each returns a value of its type and never raises."""
 
 from __future__ import annotations
 

@@ -1,18 +1,17 @@
-"""Workers that failed: each is counted once, and how soon they are replaced.
+"""Failed workers: each is counted once, and replaced after a delay.
 
-*One rate.*  What fails until the next are created is one wave.  Each wave takes twice as long as
-the one before, until workers live: a new one was Ready for a minute, or those that fail now were.
-Only the places of workers that failed wait; whatever else is missing is created meanwhile.
+*Delay.*  The failures up to the next creation are one wave.  The delay doubles with each wave.  It
+starts anew once workers live: a new worker was Ready for a minute, or the workers that fail now
+were.  Only the places of failed workers wait; other missing workers are created at once.
 
-*One question*, which decides whether a pool is given up: was half of what is wanted Ready for a
-minute?  If for more than ``backoffLimit`` waves in a row it was not, nothing more is created until
-the spec changes.
+*Giving up.*  After more than ``backoffLimit`` waves in a row, at none of which half of the wanted
+workers had been Ready for a minute, no pod is created until the spec changes.
 
-A worker that ends with exit code 0 and was not released waits like any, but nothing is given up for
-it: an agent ends so when it was without a master for too long.
+A worker that ends with exit code 0 without being released waits in the same way, but is no reason
+to give up: an agent ends so after it had no master for too long.
 
-All of it stands in the pool's status, so that it survives the operator; ``counted`` names the ended
-pods that still exist and are in the sums already, written before they are deleted.
+All of this is kept in the pool's status and survives a restart of the operator.  ``counted`` names
+ended pods that still exist and are already in the sums; it is written before they are deleted.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from typing import Any
 from fiber_api.names import Reason
 from fiber_api.status import MAX_COUNT
 from fiber_api.v1alpha1 import FailurePolicy, Failures
-from fiber_operator.planning.pods import BRIEF, PodView, State, Trouble
+from fiber_operator.planning.pods import BRIEF, PodState, PodView, Trouble
 
 RECOVERY = 60.0
 """Seconds for which a worker must be Ready to show that workers can live."""
@@ -163,7 +162,7 @@ def _longest(policy: FailurePolicy) -> float:
 
 
 def _failed(pod: PodView) -> bool:
-    return pod.state is State.ENDED and pod.trouble is not Trouble.DISRUPTED
+    return pod.state is PodState.ENDED and pod.trouble is not Trouble.DISRUPTED
 
 
 def in_itself(pod: PodView) -> bool:
@@ -177,9 +176,9 @@ def _disrupted(pod: PodView) -> bool:
 
 def _has_lived(pod: PodView, now: float) -> bool:
     """Tell whether a pod was Ready for long enough, as far as is known."""
-    if pod.state is State.READY:
+    if pod.state is PodState.READY:
         return now - pod.since >= RECOVERY
-    return pod.state is State.ENDED and pod.was_ready and pod.ran >= RECOVERY
+    return pod.state is PodState.ENDED and pod.was_ready and pod.ran >= RECOVERY
 
 
 def _fail(
@@ -205,7 +204,7 @@ def _fail(
 
 
 def _reason(pod: PodView) -> str:
-    if pod.state is not State.ENDED:
+    if pod.state is not PodState.ENDED:
         return Reason.STARTUP_TIMEOUT
     if in_itself(pod):
         return AT_ONCE if pod.reason == Reason.COMPLETED else pod.reason
@@ -224,7 +223,7 @@ def _recovers(
         return None
     due = found.next_create_time
     began = 0.0 if due is None else due - delay(policy, found.waves, seed)
-    ready = [pod.since for pod in pods if pod.state is State.READY]
+    ready = [pod.since for pod in pods if pod.state is PodState.READY]
     starts = [since for since in ready if since >= began]
     if len(ready) >= desired:
         starts.append(max((began, *ready)))
@@ -239,7 +238,7 @@ def _proven(
     template_hash: str,
     now: float,
 ) -> str | None:
-    ready = [p for p in pods if p.template_hash == template_hash and p.state is State.READY]
+    ready = [p for p in pods if p.template_hash == template_hash and p.state is PodState.READY]
     # Without a readiness probe a worker is Ready for a moment before it fails.  Once that has
     # happened, Ready has to last.
     if any(not found.waves or now - pod.since >= BRIEF for pod in ready):

@@ -1,37 +1,22 @@
-"""The bodies of what the operator makes.
+"""Bodies of the objects that the operator creates beside pods, and hashes of the spec.
 
-Every function returns a new plain JSON document with ``apiVersion`` and ``kind``.  Each object has
-the pool as its controller, so that deleting the pool deletes it with nobody's help, and no
-finalizer.  ``podspec`` has the pod.
+Every function returns a new JSON document with ``apiVersion`` and ``kind``.  Each object has the
+pool as its owner and no finalizer, so Kubernetes deletes it together with the pool.  ``podspec``
+makes the bodies of pods.
 """
 
 from __future__ import annotations
 
 import base64
+import hashlib
 import ipaddress
+import json
 from collections.abc import Mapping
 from typing import Any
 
 from fiber_api import names
-from fiber_api.v1alpha1 import FiberPool, Master
+from fiber_api.v1alpha1 import FiberPool, MasterSpec
 from fiber_operator.planning.documents import items, mapping, text
-from fiber_operator.planning.podspec import owner_reference, pod, pod_maker
-from fiber_operator.planning.revisions import template_hash
-
-__all__ = [
-    "budget",
-    "endpoint_slice",
-    "is_ours",
-    "other_owner",
-    "pod",
-    "pod_maker",
-    "secret",
-    "selector",
-    "service",
-    "slice_must_be_replaced",
-    "slice_patch",
-    "template_hash",
-]
 
 
 def selector(pool: FiberPool) -> str:
@@ -141,6 +126,20 @@ def slice_must_be_replaced(pool: FiberPool, existing: Mapping[str, Any]) -> bool
     return master is not None and existing.get("addressType") != _family(master)
 
 
+def owner_reference(pool: FiberPool) -> dict[str, Any]:
+    """Ties an object's life to the pool's."""
+    return {
+        "apiVersion": names.API_VERSION,
+        "kind": names.KIND,
+        "name": pool.metadata.name,
+        "uid": pool.metadata.uid,
+        "controller": True,
+        # True needs the right to change the pool's finalizers, on clusters that check it, and
+        # would let a pod that cannot end hold up the end of the pool.
+        "blockOwnerDeletion": False,
+    }
+
+
 def _metadata(pool: FiberPool, name: str) -> dict[str, Any]:
     return {
         "name": name,
@@ -154,13 +153,13 @@ def _metadata(pool: FiberPool, name: str) -> dict[str, Any]:
     }
 
 
-def _family(master: Master | None) -> str:
+def _family(master: MasterSpec | None) -> str:
     if master is None:
         return "IPv4"
     return f"IPv{ipaddress.ip_address(master.host).version}"
 
 
-def _endpoints(master: Master | None) -> list[dict[str, Any]]:
+def _endpoints(master: MasterSpec | None) -> list[dict[str, Any]]:
     if master is None:
         return []
     # Ready even where the master's Lease has expired: whoever dials finds out sooner than a Lease
@@ -169,7 +168,7 @@ def _endpoints(master: Master | None) -> list[dict[str, Any]]:
     return [{"addresses": [master.host], "conditions": conditions}]
 
 
-def _ports(master: Master | None) -> list[dict[str, Any]]:
+def _ports(master: MasterSpec | None) -> list[dict[str, Any]]:
     if master is None:
         return []
     return [{"name": names.MASTER_PORT_NAME, "port": master.port, "protocol": "TCP"}]
@@ -183,3 +182,42 @@ def _leads_to(document: Mapping[str, Any]) -> tuple[list[Any], list[Any]]:
     ]
     ports = [(text(p.get("name")), p.get("port")) for p in items(document.get("ports"))]
     return addresses, ports
+
+
+# -- Hashes
+
+_LENGTH = 16
+"""Hexadecimal digits; few enough for a label and enough for the revisions of one pool."""
+
+
+def template_hash(pool: FiberPool) -> str:
+    """Return a hash of the worker: of the template, and of the number of processes in each.
+
+    Nothing that the operator adds is in it, so that a new operator replaces no pod, and nothing
+    that the SDK writes.
+    """
+    return _digest({"template": pool.spec.template, "processes": pool.spec.processes_per_pod})
+
+
+def spec_hash(pool: FiberPool) -> str:
+    """Return a hash of all that a user or a new master changes to revive a failed pool.
+
+    ``replicas`` and ``release`` are not in it: the SDK writes them all the time.
+    """
+    spec = pool.spec
+    return _digest(
+        {
+            "template": spec.template,
+            "processes": spec.processes_per_pod,
+            "container": spec.worker_container,
+            "failures": spec.failure_policy.model_dump(),
+            "update": spec.update.model_dump(),
+            "suspend": spec.suspend,
+            "epoch": spec.master.epoch if spec.master else None,
+        }
+    )
+
+
+def _digest(document: dict[str, Any]) -> str:
+    canonical = json.dumps(document, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(canonical.encode()).hexdigest()[:_LENGTH]

@@ -1,7 +1,7 @@
-"""Inputs of ``reconcile.plan`` beside the pool and its pods, and its result.
+"""Input and result of ``reconcile.plan``, beside the pool and its pods.
 
-Values only, all frozen: the controller fills in a ``Memory`` from what it saw of the cluster and
-does what a ``Plan`` says.  The times are unix seconds.
+All classes are frozen values.  The controller fills a ``Knowledge`` with what it knows of the
+cluster, and carries out the ``Plan``.  Times are unix seconds.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _NO_ACCOUNT_YET = "error looking up service account"
 
 
 @dataclass(frozen=True)
-class Refusal:
+class PodRefusal:
     """The API server's last refusal to create a pod, or to accept one in a dry run.
 
     The controller makes one at the first 403, 422 or 400 and forgets it when a pod is created.
@@ -107,7 +107,7 @@ class LeaseVerdict:
 
 
 @dataclass(frozen=True)
-class Memory:
+class Knowledge:
     """Knowledge of the operator about a pool, beside its resource and its pods.
 
     A fresh ``Memory()`` after a restart of the operator is always right, only less informed.
@@ -129,7 +129,7 @@ class Memory:
     """Why what was to be deleted last could not be."""
     accepted: str | None = None
     """The template hash that passed the server-side dry run in this process."""
-    refusal: Refusal | None = None
+    refusal: PodRefusal | None = None
     master: LeaseVerdict = field(default_factory=LeaseVerdict)
     warnings: Mapping[str, str] = field(default_factory=dict)
     """Pod name -> the newest event about it, as ``Reason: message``, where that is a Warning, of
@@ -155,7 +155,7 @@ class Deletion:
 
 
 @dataclass(frozen=True)
-class Event:
+class PoolEvent:
     """A Kubernetes event on the pool.  The planner emits one at a transition, never per look."""
 
     type: str
@@ -196,7 +196,7 @@ class Plan:
     status: Mapping[str, Any] | None = None
     """The whole of ``status`` if it differs from what the pool has, else None.  For a merge patch
     on the status subresource: a field that is to go away is None in it, lists are whole."""
-    events: tuple[Event, ...] = ()
+    events: tuple[PoolEvent, ...] = ()
     inspect: tuple[str, ...] = ()
     """Names of pods, one at most, that have a node and are not Ready for some seconds, and whose
     status does not say why.  What the kubelet is stuck at (a volume whose Secret is missing, a

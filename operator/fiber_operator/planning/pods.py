@@ -1,7 +1,7 @@
-"""Views of pods, with the few facts that the planner needs.
+"""Views of pods with the facts that the planner needs.
 
-A pod comes as the JSON of the API, where any field may be missing or nonsense; a ``PodView`` is
-always whole.
+A pod comes as the API's JSON, in which any field may be missing or have the wrong type.  The
+fields of a ``PodView`` always have their types.
 """
 
 from __future__ import annotations
@@ -11,18 +11,20 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from fiber_api.names import ANNOTATION_DELETION_COST, ENV_ADDRESS, LABEL_TEMPLATE_HASH
-from fiber_operator.planning import readiness
+from fiber_api import names
 from fiber_operator.planning.documents import items, mapping, seconds, text, whole
 
 BRIEF = 10.0
 """Seconds.  A worker that ends sooner never did its job, whatever its exit code."""
 
+PROBE_PROGRAM = f"{names.CREDENTIALS_DIRECTORY}/{names.PROBE_PROGRAM}"
+"""Command by which a worker's startup probe is recognized as the operator's."""
+
 LONGEST_MESSAGE = 1000
 """Characters that are kept of what the cluster says, its end: there the cause of a traceback is."""
 
 
-class State(StrEnum):
+class PodState(StrEnum):
     """State of a pod.  ``TERMINATING`` and ``ENDED`` pods are not live."""
 
     PENDING = "Pending"
@@ -65,7 +67,7 @@ class PodView:
     """The uid of the controller that owns it; empty if none does."""
     created: float
     template_hash: str
-    state: State
+    state: PodState
     since: float
     """Time at which it came into this state, as far as the cluster says."""
     was_ready: bool = False
@@ -94,7 +96,7 @@ class PodView:
     @property
     def live(self) -> bool:
         """True if the pod counts as a replica."""
-        return self.state not in (State.TERMINATING, State.ENDED)
+        return self.state not in (PodState.TERMINATING, PodState.ENDED)
 
 
 def observe(pod: Mapping[str, Any], container: str) -> PodView:
@@ -176,18 +178,18 @@ class _Observation:
             resource_version=text(self._meta.get("resourceVersion")),
             owner=self._owner(),
             created=self._created,
-            template_hash=text(mapping(self._meta, "labels").get(LABEL_TEMPLATE_HASH)),
+            template_hash=text(mapping(self._meta, "labels").get(names.LABEL_TEMPLATE_HASH)),
             state=state,
             since=self._since(state),
             was_ready=self._was_ready(),
-            joining=state is State.READY and self._is_joining(),
+            joining=state is PodState.READY and self._is_joining(),
             trouble=trouble,
             reason=reason,
             message=_shorten(message),
             exit_code=_exit_code(self._ending()),
             ran=self._ran(),
             scheduled=self._scheduled,
-            lingers=state is State.ENDED and self._others_go_on(),
+            lingers=state is PodState.ENDED and self._others_go_on(),
             deletion_cost=self._deletion_cost(),
             address=self._address(),
             init_container="" if self._end else text(self._failed_init().get("name")),
@@ -195,16 +197,16 @@ class _Observation:
 
     # Where it is in its life
 
-    def _life(self) -> State:
+    def _life(self) -> PodState:
         if self._meta.get("deletionTimestamp"):
-            return State.TERMINATING
+            return PodState.TERMINATING
         if self._phase in ("Failed", "Succeeded") or self._end:
-            return State.ENDED
+            return PodState.ENDED
         if self._ready():
-            return State.READY
+            return PodState.READY
         if not isinstance(self._state.get("running"), Mapping):
-            return State.PENDING
-        return State.NOT_READY if self._was_ready() else State.STARTING
+            return PodState.PENDING
+        return PodState.NOT_READY if self._was_ready() else PodState.STARTING
 
     def _ready(self) -> bool:
         return self._condition("Ready").get("status") == "True" or self._is_joining()
@@ -213,7 +215,7 @@ class _Observation:
         return (
             self._condition("Ready").get("status") == "False"
             and isinstance(self._state.get("running"), Mapping)
-            and readiness.is_awaited(self._worker, self._own)
+            and _awaits_its_agent(self._worker, self._own)
             and all(other.get("ready") is True for other in self._others)
         )
 
@@ -228,15 +230,15 @@ class _Observation:
         started = seconds(mapping(running or self._end).get("startedAt"))
         return 0 < started < seconds(self._condition("Ready").get("lastTransitionTime"))
 
-    def _since(self, state: State) -> float:
-        if state is State.TERMINATING:
+    def _since(self, state: PodState) -> float:
+        if state is PodState.TERMINATING:
             return seconds(self._meta.get("deletionTimestamp")) or self._created
-        if state is State.ENDED:
+        if state is PodState.ENDED:
             ended = seconds(self._ending().get("finishedAt"))
             return ended or self._changed("Ready") or self._created
-        if state in (State.READY, State.NOT_READY) and not self._is_joining():
+        if state in (PodState.READY, PodState.NOT_READY) and not self._is_joining():
             return self._changed("Ready") or self._created
-        if state in (State.READY, State.STARTING):
+        if state in (PodState.READY, PodState.STARTING):
             started = seconds(mapping(self._state, "running").get("startedAt"))
             return started or self._created
         return self._created
@@ -261,15 +263,15 @@ class _Observation:
 
     # What is wrong with it
 
-    def _trouble(self, state: State) -> tuple[Trouble | None, str, str]:
-        if state is State.ENDED:
+    def _trouble(self, state: PodState) -> tuple[Trouble | None, str, str]:
+        if state is PodState.ENDED:
             return self._why_ended()
-        if state is State.PENDING:
+        if state is PodState.PENDING:
             return self._why_pending()
-        if state in (State.STARTING, State.NOT_READY):
+        if state in (PodState.STARTING, PodState.NOT_READY):
             condition = self._condition("Ready")
             return None, text(condition.get("reason")), text(condition.get("message"))
-        if state is State.TERMINATING and self._disruption():
+        if state is PodState.TERMINATING and self._disruption():
             return Trouble.DISRUPTED, *self._disruption_words()
         return None, "", ""
 
@@ -352,10 +354,12 @@ class _Observation:
 
     def _address(self) -> str:
         variables = items(self._worker.get("env"))
-        return next((text(v.get("value")) for v in variables if v.get("name") == ENV_ADDRESS), "")
+        return next(
+            (text(v.get("value")) for v in variables if v.get("name") == names.ENV_ADDRESS), ""
+        )
 
     def _deletion_cost(self) -> int:
-        cost = text(mapping(self._meta, "annotations").get(ANNOTATION_DELETION_COST))
+        cost = text(mapping(self._meta, "annotations").get(names.ANNOTATION_DELETION_COST))
         try:
             return int(cost or "0")
         except ValueError:
@@ -377,3 +381,11 @@ def _exit_code(end: Mapping[str, Any]) -> int | None:
 def _shorten(message: str) -> str:
     message = message.strip()
     return message if len(message) <= LONGEST_MESSAGE else "..." + message[-LONGEST_MESSAGE:]
+
+
+def _awaits_its_agent(worker: Mapping[str, Any], status: Mapping[str, Any]) -> bool:
+    """Return whether nothing but its agent's link is missed of the container with this status."""
+    if status.get("started") is not False or worker.get("readinessProbe"):
+        return False
+    command = mapping(worker, "startupProbe", "exec").get("command")
+    return isinstance(command, list) and bool(command) and text(command[0]) == PROBE_PROGRAM

@@ -1,22 +1,34 @@
-"""The body of a worker pod: the user's template, and what Fiber adds where it says nothing.
+"""Body of a worker pod: the user's template, with Fiber's additions where the template is silent.
 
-What the user's template says wins, field by field, and what it says in a way that makes no sense
-is passed on: the API server's complaint about it is better than one of ours.  Only these are not
-the template's to say: the name (the agent's variable of it included), the owner, Fiber's labels, no
-finalizer, and ``restartPolicy: Never``.
+Each field of the template wins over Fiber's value.  A field that makes no sense is passed on, since
+the API server's complaint about it is the better one.  The operator alone sets the pod's name and
+the environment variable with that name, the owner, Fiber's labels, the absence of finalizers, and
+``restartPolicy: Never``.
+
+An init container gives each agent a key of its own and hides the pool's key from tasks.  It mounts
+the pool's Secret, derives the agent's key from it and the pod's name and uid, and writes that key
+to a volume in memory.  The agent reads the file and removes it.  The init container runs the
+worker's command on the worker's image, without the volumes, environment and working directory of
+the template, because a task could have written to these.  The exception is a volume that the
+command names, because the interpreter is on it.
+
+A startup probe waits until a master has answered the agent.  After that the agent serves a master,
+waits for the next one, or ends; so the probe succeeds once and costs nothing afterwards.  A pod
+that is created while its pool has no living master has no such probe.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from fiber_api import names
-from fiber_api.v1alpha1 import FiberPool, Master
-from fiber_operator.planning import credentials, readiness
+from fiber_api.v1alpha1 import FiberPool, MasterSpec
+from fiber_operator.planning.assessment import awaits_agents
 from fiber_operator.planning.documents import items, mapping, text
-from fiber_operator.planning.revisions import template_hash
+from fiber_operator.planning.manifests import owner_reference, template_hash
+from fiber_operator.planning.pods import PROBE_PROGRAM
 
 NODE_LOST_SECONDS = 60
 """Seconds for which a pod stays bound to a silent node.  Kubernetes' default is five minutes.  A
@@ -25,7 +37,7 @@ worker's tasks go to others after seconds, and the pool should not lack the work
 _NODE_LOST = ("node.kubernetes.io/not-ready", "node.kubernetes.io/unreachable")
 _EVICTION = "NoExecute"
 
-_LOST_GRACE: int = Master.model_fields["lost_grace_seconds"].default
+_LOST_GRACE: int = MasterSpec.model_fields["lost_grace_seconds"].default
 
 _TERMINATION_GRACE = 30
 """Seconds, where the template does not say: Kubernetes' own default."""
@@ -54,20 +66,6 @@ _POD_METADATA = frozenset(
 
 _TMP = "/tmp"
 _TMP_VOLUME = "fiber-tmp"
-
-
-def owner_reference(pool: FiberPool) -> dict[str, Any]:
-    """Ties an object's life to the pool's."""
-    return {
-        "apiVersion": names.API_VERSION,
-        "kind": names.KIND,
-        "name": pool.metadata.name,
-        "uid": pool.metadata.uid,
-        "controller": True,
-        # True needs the right to change the pool's finalizers, on clusters that check it, and
-        # would let a pod that cannot end hold up the end of the pool.
-        "blockOwnerDeletion": False,
-    }
 
 
 NO_REQUESTS: Mapping[str, str] = {}
@@ -109,8 +107,8 @@ def _pod(
         if container.get("name") == pool.spec.worker_container:
             _equip(spec, container, variables)
             _request(spec, container, requests)
-            credentials.add(pool, spec, container)
-            readiness.add(pool, spec, container)
+            _add_identity_container(pool, spec, container)
+            _add_startup_probe(pool, spec, container)
     return {
         **_others(template, _POD),
         "apiVersion": "v1",
@@ -210,7 +208,7 @@ def _variables(
     return {
         names.ENV_NAME: name,
         names.ENV_ADDRESS: address,
-        names.ENV_CREDENTIALS: f"{names.CREDENTIALS_DIRECTORY}/{names.CREDENTIALS_FILE}",
+        names.ENV_CREDENTIALS: _CREDENTIALS,
         names.ENV_POOL: pool.metadata.name,
         names.ENV_NAMESPACE: pool.metadata.namespace,
         names.ENV_PROCESSES: str(pool.spec.processes_per_pod),
@@ -296,3 +294,137 @@ def _default(document: dict[str, Any], key: str, value: Any) -> Any:
 def _containers(spec: Mapping[str, Any], kind: str) -> list[dict[str, Any]]:
     listed = spec.get(kind)
     return [c for c in listed if isinstance(c, dict)] if isinstance(listed, list) else []
+
+
+# -- The init container
+
+_LIKE_THE_WORKER = (
+    "args",
+    "command",
+    "image",
+    "imagePullPolicy",
+    "securityContext",
+    "terminationMessagePolicy",
+)
+
+_AGENT = "fiber.agent"
+
+_ASKED_FOR = ("cpu", "memory", "ephemeral-storage")
+"""A pod asks for the larger of what its init containers and its containers ask for: as much as the
+worker does costs nothing, and meets every quota and limit range that the worker meets.  A device is
+of no use here."""
+
+_CREDENTIALS = f"{names.CREDENTIALS_DIRECTORY}/{names.CREDENTIALS_FILE}"
+
+
+def _add_identity_container(pool: FiberPool, spec: dict[str, Any], worker: dict[str, Any]) -> None:
+    """Give the pod its init container, and what the worker's ``container`` mounts for it."""
+    volumes, first = spec.get("volumes") or [], spec.get("initContainers") or []
+    mounts = worker.get("volumeMounts") or []
+    if not (isinstance(volumes, list) and isinstance(first, list) and isinstance(mounts, list)):
+        return
+    if any(
+        text(m.get("mountPath")).rstrip("/") == names.CREDENTIALS_DIRECTORY for m in items(mounts)
+    ):
+        return  # the template's own way to hand credentials over
+    spec["volumes"] = [
+        *volumes,
+        {
+            "name": names.KEY_VOLUME,
+            # Any user may read it that the image runs as; no other container mounts it.
+            "secret": {"secretName": pool.credentials_secret, "defaultMode": 0o444},
+        },
+        {"name": names.CREDENTIALS_VOLUME, "emptyDir": {"medium": "Memory", "sizeLimit": "1Mi"}},
+    ]
+    mount = {"name": names.CREDENTIALS_VOLUME, "mountPath": names.CREDENTIALS_DIRECTORY}
+    spec["initContainers"] = [_identity_container(worker, mount), *first]
+    worker["volumeMounts"] = [*mounts, mount]
+
+
+def _identity_container(worker: Mapping[str, Any], written: Mapping[str, Any]) -> dict[str, Any]:
+    made = {k: copy.deepcopy(worker[k]) for k in _LIKE_THE_WORKER if worker.get(k) is not None}
+    made["name"] = names.IDENTITY_CONTAINER
+    if not _runs_the_agent(worker):
+        made.pop("args", None)
+        made["command"] = ["python", "-m", _AGENT]
+    made["volumeMounts"] = [
+        *_mounts_of_the_interpreter(worker, made),
+        dict(written),
+        {"name": names.KEY_VOLUME, "mountPath": names.KEY_DIRECTORY, "readOnly": True},
+    ]
+    if resources := _resources(worker):
+        made["resources"] = resources
+    made["env"] = [
+        {"name": names.ENV_KEY, "value": names.KEY_DIRECTORY},
+        {"name": names.ENV_CREDENTIALS, "value": _CREDENTIALS},
+        _of_the_pod(names.ENV_NAME, "metadata.name"),
+        _of_the_pod(names.ENV_UID, "metadata.uid"),
+    ]
+    return made
+
+
+def _mounts_of_the_interpreter(
+    worker: Mapping[str, Any], made: Mapping[str, Any]
+) -> Iterator[dict[str, Any]]:
+    """The mounts without which the command could not run: it names a path on them."""
+    command = str([made.get("command"), made.get("args")])
+    for mount in items(worker.get("volumeMounts")):
+        path = text(mount.get("mountPath")).rstrip("/")
+        if path and f"{path}/" in command:
+            yield {**copy.deepcopy(dict(mount)), "readOnly": True}
+
+
+def _runs_the_agent(worker: Mapping[str, Any]) -> bool:
+    """Tell whether the worker container runs the agent, by its command or its image."""
+    words = [worker.get("command"), worker.get("args")]
+    return not any(words) or _AGENT in str(words)
+
+
+def _resources(worker: Mapping[str, Any]) -> dict[str, Any]:
+    found = {}
+    for kind in ("limits", "requests"):
+        asked = mapping(worker, "resources", kind)
+        if kept := {name: asked[name] for name in _ASKED_FOR if name in asked}:
+            found[kind] = kept
+    return found
+
+
+def _of_the_pod(name: str, field: str) -> dict[str, Any]:
+    return {"name": name, "valueFrom": {"fieldRef": {"apiVersion": "v1", "fieldPath": field}}}
+
+
+# -- The startup probe
+
+_LINKED_FILE = f"{names.CREDENTIALS_DIRECTORY}/{names.LINKED_FILE}"
+
+_SCRIPT = """\
+import os, sys, time
+for _ in range(200):
+    if os.path.exists(sys.argv[1]):
+        sys.exit()
+    time.sleep(0.1)
+sys.exit("no master has answered the agent yet; the log of the pod may say why")
+"""
+"""Command of the probe.  A sleeping process is cheaper than a process each second, and faster."""
+
+_PROBE: Mapping[str, Any] = {
+    # Without the site module an interpreter needs a hundredth of a second.
+    "exec": {"command": [PROBE_PROGRAM, "-ISc", _SCRIPT, _LINKED_FILE]},
+    "initialDelaySeconds": 1,  # the processor is the agent's while that starts
+    "periodSeconds": 2,
+    "timeoutSeconds": 30,
+    "failureThreshold": 2**31 - 1,  # it ends no pod
+}
+
+
+def _add_startup_probe(pool: FiberPool, spec: Mapping[str, Any], worker: dict[str, Any]) -> None:
+    """Give the worker's ``container`` the probe, where its agent is known to be one of ours."""
+    first = next(items(spec.get("initContainers") or ()), {})
+    if first.get("name") != names.IDENTITY_CONTAINER or not _runs_the_agent(worker):
+        return
+    if not awaits_agents(pool) or worker.get("startupProbe") is not None:
+        return
+    if not isinstance(worker.get("env"), list):
+        return
+    worker["startupProbe"] = dict(_PROBE)
+    worker["env"] = [{"name": names.ENV_LINKED, "value": _LINKED_FILE}, *worker["env"]]

@@ -1,46 +1,190 @@
-"""The only place where it is decided which pods are created and deleted.
+"""Plan of a reconcile: which pods are created and deleted.
 
 ::
 
-    pool, pods, memory, now
-      │
-      ├─ attachment   is a master there, alive, lost for good?
-      ├─ scaling      who goes: released, suspended, outdated, too many, ended and looked at
-      ├─ failures     who failed since the last look; when their places are taken again
-      ├─ scaling      who comes: as many as are missing, a few of a template that never worked
-      ├─ problems     what is wrong
-      └─ status       what to say of all that, and events what to announce
+    pool, pods, knowledge, now
+      |
+      +- assessment   is a master there, alive, lost for good?  which pods failed?
+      +- deletions    released, suspended, outdated, surplus, ended and counted
+      +- creations    missing pods; at first only a few pods of a template that never worked
+      +- problems     what is wrong
+      +- status       conditions, counts and events
 
-What with and without a master
-------------------------------
-While a master is attached (``spec.master`` is set and its Lease is not known to have been expired
-for longer than its grace) a Ready worker may be at work.  Under ``ReleasedOnly`` it is deleted
-only when released; an outdated one is then replaced by the next creation.  With no master, or one
-that is lost for good, no worker is at work: lowering ``replicas`` takes any, and outdated ones are
-replaced by themselves, a quarter at a time.  ``suspend`` and ``Recreate`` are a person's order and
-stop for nobody.
+With and without a master
+-------------------------
+A master is attached while ``spec.master`` is set and its Lease has not been expired for longer
+than its grace period.  Only the attached master knows which workers are idle.  Under
+``ReleasedOnly`` the operator then deletes a running worker only if the master released it; this is
+also how outdated workers are replaced.  A pod whose worker container does not run yet may always be
+deleted.  Without a master no worker has work: the operator may delete any of them, and it replaces
+outdated ones by itself, a quarter at a time.  ``suspend`` and ``Recreate`` apply in both cases.
 
-A master that is lost keeps everything it has until its grace is over; nothing new is created for
-it, unless ``onLost`` is ``Retain``.  Then ``Delete`` deletes the FiberPool, ``ScaleToMin`` wants
-``minReplicas``, ``Retain`` wants what ``replicas`` says.
+A lost master keeps its pods until its grace period ends, but no pod is created for it unless
+``onLost`` is ``Retain``.  When the grace period ends, ``Delete`` deletes the FiberPool,
+``ScaleToMin`` wants ``minReplicas``, and ``Retain`` wants what ``replicas`` says.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 from fiber_api.names import Reason
 from fiber_api.v1alpha1 import FiberPool, FiberPoolStatus, Problem
-from fiber_operator.planning import failures, problems, scaling, status, wording
+from fiber_operator.planning import failures, messages, problems, status
 from fiber_operator.planning.assessment import Assessment
-from fiber_operator.planning.conditions import Counts, Outlook
 from fiber_operator.planning.documents import items, mapping, text
-from fiber_operator.planning.events import Change, events
-from fiber_operator.planning.plans import Deletion, Event, Memory, Obstacle, Plan
-from fiber_operator.planning.pods import PodView, State, Trouble
-from fiber_operator.planning.situation import SECOND_LOOK, Situation
+from fiber_operator.planning.plans import Deletion, Knowledge, Obstacle, Plan, PoolEvent
+from fiber_operator.planning.pods import PodState, PodView, Trouble
+from fiber_operator.planning.problems import SECOND_LOOK, Situation
+from fiber_operator.planning.status import Change, Outlook, PodCounts, events
+
+# -- Choice of pods
+
+CANARIES = 3
+"""Pods that try out a template that never worked."""
+
+PATIENCE = 30.0
+"""Seconds after which canaries of which nothing bad is known are joined by as many again."""
+
+
+def outdated_to_replace(
+    live: Sequence[PodView],
+    *,
+    template_hash: str,
+    strategy: str,
+    attached: bool,
+    desired: int,
+    proven: bool,
+) -> list[PodView]:
+    """Pods of an older template that go now.
+
+    ``OnDelete``: none.  ``Recreate``: all, at work or not.  ``OnIdle``: those that do not run yet.
+    The others may be at work while a master is attached; it sees ``updatedReplicas`` and releases
+    them when they are idle.  Without one those that were never Ready go too, and the others a
+    quarter at a time, and no more than there may be canaries until the new template is ``proven``
+    to work.
+    """
+    outdated = [pod for pod in live if pod.template_hash != template_hash]
+    if strategy == "OnDelete":
+        return []
+    if strategy == "Recreate":
+        return outdated
+    if attached:
+        return _idle(outdated)
+    fresh = [pod for pod in outdated if not pod.was_ready]
+    unready = [pod for pod in outdated if pod.was_ready and pod.state is not PodState.READY]
+    ready = [pod for pod in outdated if pod.state is PodState.READY]
+    missing = desired - sum(pod.state is PodState.READY for pod in live)
+    quarter = max(1, desired // 4)
+    spare = max(0, (quarter if proven else min(quarter, CANARIES)) - max(0, missing))
+    return fresh + unready + expendable(ready, template_hash)[:spare]
+
+
+def _idle(pods: Sequence[PodView]) -> list[PodView]:
+    """Return the pods that no master can have given work to."""
+    return [pod for pod in pods if pod.state is PodState.PENDING]
+
+
+def expendable(pods: Sequence[PodView], template_hash: str) -> list[PodView]:
+    """The order in which policy ``Any`` takes pods.
+
+    Pending, then outdated, then not ready, then of the lowest deletion cost, then the newest.
+    """
+    return sorted(
+        pods,
+        key=lambda pod: (
+            pod.state is not PodState.PENDING,
+            pod.template_hash == template_hash,
+            pod.state is PodState.READY,
+            pod.deletion_cost,
+            -pod.created,
+            pod.name,
+        ),
+    )
+
+
+def excess_to_delete(
+    live: Sequence[PodView], excess: int, *, template_hash: str, free_choice: bool
+) -> list[PodView]:
+    """Pods that go because fewer are wanted; may be fewer than ``excess``."""
+    if free_choice:
+        candidates = expendable(live, template_hash)
+    else:
+        candidates = sorted(_idle(live), key=lambda pod: (-pod.created, pod.name))
+    return candidates[: max(0, excess)]
+
+
+def released_to_delete(
+    pods: Sequence[PodView], released: Collection[str], *, floor: int, template_hash: str
+) -> list[PodView]:
+    """Pods that the master has released, but for those that would be made anew at once.
+
+    A new worker in the place of an idle one would be as idle, and released in turn: the last
+    ``floor`` live ones stay.  Those of an older template go, for that is how it is updated.
+    """
+    named = [pod for pod in pods if pod.name in released]
+    current = [pod for pod in named if pod.live and pod.template_hash == template_hash]
+    others = [pod for pod in named if pod not in current]
+    live = sum(pod.live for pod in pods) - sum(pod.live for pod in others)
+    return others + expendable(current, template_hash)[: max(0, live - floor)]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Number of pods of a template that may be added now."""
+
+    room: int | None = None
+    """None: as many as are wanted."""
+    again: float | None = None
+    """Time at which there will be more room, if nothing happens until then."""
+
+
+def assess_trial(
+    current: Sequence[PodView], *, proven: bool, failing: bool, held_back: int, now: float
+) -> Trial:
+    """Judge whether a template with these ``current`` live pods is still being tried out.
+
+    It is until one of its pods is Ready.  A pod that cannot start, or ``failing`` ones before
+    these, leave it at the canaries that there are, the places of failed ones that are ``held_back``
+    included.  While nothing is wrong their number doubles each ``PATIENCE``, for an image may take
+    long to fetch and fetching it on three nodes does not help the others.  Pods that no node takes
+    do not count, and let as many again ask for a node: a cluster autoscaler must see the whole
+    demand.
+    """
+    if proven:
+        return Trial()
+    if failing or any(pod.trouble is Trouble.CANNOT_START for pod in current):
+        return Trial(max(0, CANARIES - len(current) - held_back))
+    turned_away = sum(pod.trouble is Trouble.UNSCHEDULABLE for pod in current)
+    placed = len(current) - turned_away
+    room = max(CANARIES, turned_away) - placed
+    if room > 0:
+        return Trial(room)
+    due = max(pod.created for pod in current) + PATIENCE
+    return Trial(placed) if now >= due else Trial(0, due)
+
+
+KEPT = 3
+"""Failed pods that are kept for ``kubectl logs``."""
+
+
+def ended_to_delete(ended: Sequence[PodView], settled: Collection[str]) -> list[PodView]:
+    """Ended pods that are of no more use: all that are ``settled``, which means counted if they
+    are to be, but the last that failed.
+
+    A pod whose other containers go on is not kept: it would hold its resources.
+    """
+    failed = sorted(
+        (p for p in ended if p.trouble is Trouble.APPLICATION and not p.lingers),
+        key=lambda pod: (pod.since, pod.name),
+    )
+    kept = {pod.name for pod in failed[-KEPT:]}
+    return [pod for pod in ended if pod.name not in kept and pod.name in settled]
+
+
+# -- The plan
 
 STUCK = 5.0
 """Seconds after which a pod's events are looked at, if its status does not say why it waits."""
@@ -51,7 +195,7 @@ _ENDED: Mapping[Trouble | None, Reason] = {
 }
 
 
-def plan(pool: FiberPool, pods: Sequence[PodView], memory: Memory, now: float) -> Plan:
+def plan(pool: FiberPool, pods: Sequence[PodView], knowledge: Knowledge, now: float) -> Plan:
     """Plan the work that brings the cluster nearer to ``pool``.
 
     ``pods`` are all pods with the label of the pool's uid, from a fresh list; those that another
@@ -62,7 +206,7 @@ def plan(pool: FiberPool, pods: Sequence[PodView], memory: Memory, now: float) -
         (p for p in pods if p.owner == pool.metadata.uid and p.name and p.uid),
         key=lambda pod: (pod.created, pod.name),
     )
-    return _Planner(Assessment(pool, own, memory, now)).plan()
+    return _Planner(Assessment(pool, own, knowledge, now)).plan()
 
 
 def plan_unreadable(
@@ -80,7 +224,7 @@ def plan_blind(document: Mapping[str, Any], obstacle: Obstacle, now: float) -> P
     described = status.describe_blind(document, obstacle, now)
     said = {text(p.get("reason")) for p in items(mapping(document, "status").get("problems"))}
     news = described is not None and obstacle.reason not in said
-    event = Event("Warning", obstacle.reason, obstacle.message)
+    event = PoolEvent("Warning", obstacle.reason, obstacle.message)
     return Plan(status=described, events=(event,) if news else ())
 
 
@@ -95,7 +239,11 @@ class _Planner:
 
     def plan(self) -> Plan:
         """The whole of it."""
-        if self._facts.attachment.gone and self._spec.on_lost == "Delete" and not self._facts.ends:
+        if (
+            self._facts.master_state.gone
+            and self._spec.on_lost == "Delete"
+            and not self._facts.ends
+        ):
             return self._delete_pool()
         if not self._facts.ends:
             self._delete()
@@ -121,9 +269,11 @@ class _Planner:
 
     def _delete_pool(self) -> Plan:
         facts = self._facts
-        assert facts.attachment.lost_since is not None
-        message = wording.master_lost(facts.pool, facts.attachment.lost_since, facts.memory.master)
-        event = Event("Warning", Reason.MASTER_LOST, message)
+        assert facts.master_state.lost_since is not None
+        message = messages.master_lost(
+            facts.pool, facts.master_state.lost_since, facts.knowledge.master
+        )
+        event = PoolEvent("Warning", Reason.MASTER_LOST, message)
         after = self._status(problems.find(self._situation(deletes=True)), 0, judged=facts.accepted)
         return Plan(
             delete_pool=True,
@@ -135,10 +285,10 @@ class _Planner:
     # Who goes
 
     def _delete(self) -> None:
-        facts, spec, attached = self._facts, self._spec, self._facts.attachment.attached
+        facts, spec, attached = self._facts, self._spec, self._facts.master_state.attached
         if spec.suspend:
             self._take(facts.live + facts.ended, Reason.SUSPENDED)
-        released = scaling.released_to_delete(
+        released = released_to_delete(
             facts.live + facts.ended,
             spec.scale_down.release,
             floor=facts.floor,
@@ -150,7 +300,7 @@ class _Planner:
         if facts.accepted and facts.may_create:
             self._take(self._outdated(), Reason.REPLACED, guarded=attached)
         free = spec.scale_down.policy == "Any" or not attached
-        excess = scaling.excess_to_delete(
+        excess = excess_to_delete(
             self._remaining,
             len(self._remaining) - facts.desired,
             template_hash=facts.template_hash,
@@ -158,15 +308,15 @@ class _Planner:
         )
         self._take(excess, Reason.SCALED_DOWN, guarded=not free)
         settled = facts.expected.union(self._account.failures.counted)
-        for pod in scaling.ended_to_delete(facts.ended, settled):
+        for pod in ended_to_delete(facts.ended, settled):
             self._take([pod], _ENDED.get(pod.trouble, Reason.CONTAINER_FAILED))
 
     def _outdated(self) -> list[PodView]:
-        return scaling.outdated_to_replace(
+        return outdated_to_replace(
             self._remaining,
             template_hash=self._facts.template_hash,
             strategy=self._spec.update.strategy,
-            attached=self._facts.attachment.attached,
+            attached=self._facts.master_state.attached,
             desired=self._facts.desired,
             proven=self._account.proven == self._facts.template_hash,
         )
@@ -200,7 +350,7 @@ class _Planner:
         if missing <= 0 or not self._facts.may_create or not self._facts.accepted:
             return 0, None
         current = [pod for pod in self._remaining if pod.template_hash == self._facts.template_hash]
-        trial = scaling.trial(
+        trial = assess_trial(
             current,
             proven=self._account.proven == self._facts.template_hash,
             failing=self._is_complained_of(current),
@@ -210,7 +360,7 @@ class _Planner:
         return missing if trial.room is None else min(missing, trial.room), trial.again
 
     def _is_complained_of(self, pods: Sequence[PodView]) -> bool:
-        complained = any(self._facts.memory.warnings.get(pod.name) for pod in pods)
+        complained = any(self._facts.knowledge.warnings.get(pod.name) for pod in pods)
         return complained or self._account.failures.waves > 0
 
     # What to say
@@ -222,8 +372,8 @@ class _Planner:
             live=self._remaining,
             ended=facts.ended,
             account=self._account,
-            attachment=facts.attachment,
-            memory=facts.memory,
+            master_state=facts.master_state,
+            knowledge=facts.knowledge,
             template_hash=facts.template_hash,
             wants_more=missing,
             creates=facts.may_create and (missing or not facts.accepted),
@@ -234,16 +384,16 @@ class _Planner:
     def _status(self, found: tuple[Problem, ...], create: int, *, judged: bool) -> FiberPoolStatus:
         facts = self._facts
         outlook = Outlook(
-            Counts.of(facts.pods, facts.desired, facts.template_hash),
+            PodCounts.of(facts.pods, facts.desired, facts.template_hash),
             found,
-            facts.attachment,
+            facts.master_state,
             judged=judged,
             create=create,
             delete=len(facts.live) - len(self._remaining),
             waits_until=failures.held_back_until(self._account.failures, facts.now),
             draining=0 if facts.ends else max(0, len(self._remaining) - facts.desired),
             replacing=self._to_be_replaced(),
-            lease_unreadable=bool(facts.memory.master.unreadable),
+            lease_unreadable=bool(facts.knowledge.master.unreadable),
         )
         return status.describe(facts, outlook, self._account)
 
@@ -254,7 +404,7 @@ class _Planner:
 
     def _to_inspect(self) -> Iterator[str]:
         """Whose events may say more: what failed though it runs, for it goes now; then others."""
-        yield from (p.name for p in self._account.failed[-1:] if p.state is not State.ENDED)
+        yield from (p.name for p in self._account.failed[-1:] if p.state is not PodState.ENDED)
         yield from (p.name for p in self._silent() if self._facts.now >= p.created + STUCK)
 
     def _silent(self) -> list[PodView]:
@@ -273,13 +423,13 @@ class _Planner:
         times = [
             trial_ends,
             self._account.recovers,
-            self._facts.attachment.due,
+            self._facts.master_state.due,
             self._facts.idleness.due,
             self._facts.refused_until,
             failures.held_back_until(self._account.failures, self._facts.now),
             *(self._next_inspection(pod) for pod in self._silent()[:1]),
             *(pod.created + timeout for pod in self._remaining if not pod.was_ready),
-            *(pod.since + timeout for pod in self._remaining if pod.state is State.STARTING),
+            *(pod.since + timeout for pod in self._remaining if pod.state is PodState.STARTING),
             *(p.since + SECOND_LOOK for p in found if p.severity == "Warning" and p.since),
         ]
         return min(

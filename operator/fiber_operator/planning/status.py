@@ -1,42 +1,300 @@
-"""The status document.  Equal input gives an equal document, with no time that moves by itself."""
+"""Status of a pool: its conditions, phase and counts, and the events of a plan.
+
+Equal input gives an equal status.  A status holds no time that changes by itself.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
 
 from fiber_api import names
 from fiber_api.names import ConditionType, Phase, Reason
-from fiber_api.v1alpha1 import FiberPool, FiberPoolStatus, Problem
-from fiber_operator.planning import manifests
-from fiber_operator.planning.assessment import Assessment
-from fiber_operator.planning.conditions import (
-    Counts,
-    Finding,
-    Outlook,
-    Truth,
-    conditions,
-    dated,
-    phase,
-)
+from fiber_api.times import format_time
+from fiber_api.v1alpha1 import FiberPool, FiberPoolStatus, PoolCondition, Problem
+from fiber_operator.planning import manifests, messages
+from fiber_operator.planning.assessment import Assessment, MasterState
 from fiber_operator.planning.documents import mapping, past, whole
 from fiber_operator.planning.failures import Account
-from fiber_operator.planning.plans import Obstacle
-from fiber_operator.planning.pods import PodView
-from fiber_operator.planning.situation import SECOND_LOOK
+from fiber_operator.planning.plans import Deletion, Obstacle, PoolEvent
+from fiber_operator.planning.pods import PodState, PodView
+from fiber_operator.planning.problems import SECOND_LOOK
+
+# -- Conditions
+
+Truth = Literal["True", "False", "Unknown"]
+
+
+@dataclass(frozen=True)
+class PodCounts:
+    """Numbers of pods by state."""
+
+    desired: int
+    live: int
+    ready: int
+    joining: int
+    """Pods that run, and whose agents have not reached a master yet."""
+    pending: int
+    """Live and never Ready."""
+    terminating: int
+    updated: int
+
+    @classmethod
+    def of(cls, pods: Sequence[PodView], desired: int, template_hash: str) -> PodCounts:
+        """Count them."""
+        live = [pod for pod in pods if pod.live]
+        return cls(
+            desired=desired,
+            live=len(live),
+            ready=sum(pod.state is PodState.READY and not pod.joining for pod in live),
+            joining=sum(pod.joining for pod in live),
+            pending=sum(not pod.was_ready for pod in live),
+            terminating=sum(pod.state is PodState.TERMINATING for pod in pods),
+            updated=sum(pod.template_hash == template_hash for pod in live),
+        )
+
+
+@dataclass(frozen=True)
+class Outlook:
+    """State of the pool, and what is about to happen."""
+
+    counts: PodCounts
+    problems: tuple[Problem, ...]
+    master_state: MasterState
+    judged: bool = True
+    """True if the API server has judged the template, as far as that matters."""
+    create: int = 0
+    delete: int = 0
+    """Live pods that go now."""
+    waits_until: float | None = None
+    """Workers that failed are not replaced before this time."""
+    draining: int = 0
+    """Workers more than wanted, of which only the master may say which are idle."""
+    replacing: int = 0
+    """Live pods of an older template that are to be replaced, now or when they are idle."""
+    lease_unreadable: bool = False
+    """True if there is no right to read the master's Lease."""
+
+    @property
+    def worst(self) -> Problem | None:
+        """The first problem that is an error."""
+        return next((p for p in self.problems if p.severity == "Error"), None)
+
+    def problem(self, *reasons: str) -> Problem | None:
+        """The worst of these."""
+        return next((p for p in self.problems if p.reason in reasons), None)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Condition without its history."""
+
+    type: ConditionType
+    status: Truth
+    reason: str
+    message: str = ""
+    since: float | None = None
+    """Time since when, if that is known otherwise than from the condition's history."""
+
+
+def conditions(pool: FiberPool, outlook: Outlook, now: float) -> tuple[PoolCondition, ...]:
+    """All of them; a condition keeps its time while its status stays as it is."""
+    before = {condition.type: condition for condition in pool.status.conditions}
+    return tuple(
+        dated(finding, before.get(finding.type), pool.metadata.generation, now)
+        for finding in _findings(pool, outlook)
+    )
+
+
+def dated(
+    finding: Finding, before: PoolCondition | None, generation: int, now: float
+) -> PoolCondition:
+    """A finding with the time since when it is so."""
+    same = before is not None and before.status == finding.status
+    since = finding.since
+    if since is None and before is not None and same:
+        since = past(before.last_transition_time, now)
+    return PoolCondition(
+        type=finding.type,
+        status=finding.status,
+        reason=finding.reason,
+        message=finding.message,
+        last_transition_time=since or float(math.floor(now)),
+        observed_generation=generation,
+    )
+
+
+def phase(pool: FiberPool, found: Sequence[PoolCondition], outlook: Outlook) -> Phase:
+    """The conditions in one word."""
+    status = {condition.type: condition.status for condition in found}
+    if pool.metadata.deletion_timestamp is not None:
+        return Phase.TERMINATING
+    if status[ConditionType.SUSPENDED] == "True":
+        return Phase.SUSPENDED
+    if outlook.problem(*_FINAL):
+        return Phase.FAILED
+    if status[ConditionType.DEGRADED] == "True":
+        return Phase.DEGRADED
+    if not outlook.judged and not outlook.counts.live:
+        return Phase.PENDING
+    if status[ConditionType.READY] != "True" or status[ConditionType.PROGRESSING] == "True":
+        return Phase.SCALING
+    return Phase.READY
+
+
+_FINAL = (Reason.BACKOFF_LIMIT_EXCEEDED, Reason.INVALID_TEMPLATE)
+
+_UNACCEPTABLE = (
+    Reason.INVALID_SPEC,
+    Reason.INVALID_TEMPLATE,
+    Reason.FORBIDDEN,
+    Reason.REQUESTS_MISSING,
+    Reason.NAME_TAKEN,
+    Reason.INVALID_CREDENTIALS,
+)
+
+
+def _findings(pool: FiberPool, outlook: Outlook) -> Iterator[Finding]:
+    yield _accepted(outlook)
+    yield _ready(pool, outlook)
+    yield _progressing(pool, outlook)
+    yield _degraded(outlook)
+    yield _master_alive(pool, outlook)
+    yield _scaling_limited(pool)
+    yield _suspended(pool)
+
+
+def _accepted(outlook: Outlook) -> Finding:
+    kind = ConditionType.ACCEPTED
+    problem = outlook.problem(*_UNACCEPTABLE)
+    if problem is not None and problem.severity == "Error":
+        return Finding(kind, "False", problem.reason, problem.message)
+    if not outlook.judged:
+        message = "the API server has not said yet whether it takes pods of this template"
+        return Finding(kind, "Unknown", Reason.NOT_JUDGED, message)
+    return Finding(kind, "True", Reason.AS_EXPECTED)
+
+
+def _ready(pool: FiberPool, outlook: Outlook) -> Finding:
+    kind, counts = ConditionType.READY, outlook.counts
+    if pool.spec.suspend:
+        return Finding(kind, "False", Reason.SUSPENDED)
+    if counts.desired == 0:
+        return Finding(kind, "True", Reason.SCALED_TO_ZERO, "no workers are wanted")
+    message = f"workers ready: {counts.ready} of {counts.desired}"
+    if counts.ready >= counts.desired:
+        return Finding(kind, "True", Reason.AS_EXPECTED, message)
+    if worst := outlook.worst:
+        return Finding(kind, "False", worst.reason, message)
+    if outlook.waits_until is not None:
+        reason = Reason.BACKING_OFF
+    else:
+        reason = Reason.CREATING if counts.live < counts.desired else Reason.STARTING
+    return Finding(kind, "False", reason, message)
+
+
+def _progressing(pool: FiberPool, outlook: Outlook) -> Finding:
+    kind, counts = ConditionType.PROGRESSING, outlook.counts
+    missing = max(0, counts.desired - counts.live)
+    lack = f"workers missing: {missing} of {counts.desired}"
+    if pool.metadata.deletion_timestamp is not None:
+        return Finding(kind, "True", Reason.TERMINATING, "the pool is being deleted")
+    if outlook.draining:
+        message = (
+            f"workers not wanted any more: {outlook.draining} of {counts.live}; only the master "
+            "knows which are idle, and they go when it names them in spec.scaleDown.release"
+        )
+        return Finding(kind, "True", Reason.DRAINING, message)
+    if outlook.create:
+        return Finding(kind, "True", Reason.CREATING, lack)
+    if outlook.waits_until is not None:
+        message = (
+            f"{lack}; those that failed are not replaced before {format_time(outlook.waits_until)}"
+        )
+        return Finding(kind, "True", Reason.BACKING_OFF, message)
+    if outlook.replacing:
+        message = f"workers of an older template: {outlook.replacing}"
+        return Finding(kind, "True", Reason.UPDATING, message)
+    if counts.pending:
+        return Finding(kind, "True", Reason.STARTING, f"workers starting: {counts.pending}")
+    if counts.joining:
+        message = f"workers that no master has answered yet: {counts.joining}"
+        return Finding(kind, "True", Reason.STARTING, message)
+    if ending := counts.terminating + outlook.delete:
+        return Finding(kind, "True", Reason.DELETING, f"workers ending: {ending}")
+    if missing and (worst := outlook.worst):
+        return Finding(kind, "False", worst.reason, lack)
+    return Finding(kind, "False", Reason.AS_EXPECTED)
+
+
+def _degraded(outlook: Outlook) -> Finding:
+    kind = ConditionType.DEGRADED
+    if worst := outlook.worst:
+        return Finding(kind, "True", worst.reason, worst.message)
+    return Finding(kind, "False", Reason.AS_EXPECTED)
+
+
+def _master_alive(pool: FiberPool, outlook: Outlook) -> Finding:
+    kind, master_state = ConditionType.MASTER_ALIVE, outlook.master_state
+    if master_state.alive is None:
+        return _master_unknown(pool, outlook)
+    if master_state.alive:
+        return Finding(kind, "True", Reason.LEASE_RENEWED)
+    lost = outlook.problem(Reason.MASTER_LOST)
+    message = lost.message if lost else ""
+    # Not the time at which an earlier master was lost: this one has its own grace.
+    return Finding(kind, "False", Reason.MASTER_LOST, message, master_state.lost_since)
+
+
+def _master_unknown(pool: FiberPool, outlook: Outlook) -> Finding:
+    kind, master = ConditionType.MASTER_ALIVE, pool.spec.master
+    if master is None:
+        return Finding(kind, "Unknown", Reason.NO_MASTER, "the pool waits for a master")
+    if master.lease_name is None:
+        message = "spec.master.leaseName is absent: nobody checks it"
+        return Finding(kind, "Unknown", Reason.LEASE_NOT_CHECKED, message)
+    if outlook.lease_unreadable:
+        message = f"the operator may not read the Lease {master.lease_name}"
+        return Finding(kind, "Unknown", Reason.FORBIDDEN, message)
+    if problem := outlook.problem(Reason.LEASE_NOT_FOUND):
+        return Finding(kind, "Unknown", Reason.LEASE_NOT_FOUND, problem.message)
+    message = f"the Lease {master.lease_name} was not seen to change yet"
+    return Finding(kind, "Unknown", Reason.LEASE_NOT_CHECKED, message)
+
+
+def _scaling_limited(pool: FiberPool) -> Finding:
+    kind, spec = ConditionType.SCALING_LIMITED, pool.spec
+    if spec.replicas > spec.max_replicas:
+        message = f"{spec.replicas} workers are asked for and maxReplicas is {spec.max_replicas}"
+        return Finding(kind, "True", Reason.ABOVE_MAXIMUM, message)
+    if 0 < spec.replicas < spec.min_replicas:  # nobody who asks for none is told that some are
+        message = f"{spec.replicas} workers are asked for and minReplicas is {spec.min_replicas}"
+        return Finding(kind, "True", Reason.BELOW_MINIMUM, message)
+    return Finding(kind, "False", Reason.WITHIN_BOUNDS)
+
+
+def _suspended(pool: FiberPool) -> Finding:
+    if pool.spec.suspend:
+        message = "spec.suspend is true: the pool has no workers"
+        return Finding(ConditionType.SUSPENDED, "True", Reason.SUSPENDED, message)
+    return Finding(ConditionType.SUSPENDED, "False", Reason.NOT_SUSPENDED)
+
+
+# -- The status document
 
 
 def describe(facts: Assessment, outlook: Outlook, account: Account) -> FiberPoolStatus:
     """The status that the pool should have.  ``account`` is that of ``facts``, or what the plan
     has made of it.
     """
-    pool, memory = facts.pool, facts.memory
+    pool, knowledge = facts.pool, facts.knowledge
     before, counts, master = pool.status, outlook.counts, pool.spec.master
     found = conditions(pool, outlook, facts.now)
-    epoch = master.epoch if master and memory.led else 0
+    epoch = master.epoch if master and knowledge.led else 0
     leads_to = names.address_of(master.host, master.port) if master else None
-    secret = pool.credentials_secret if memory.credentials else None
+    secret = pool.credentials_secret if knowledge.credentials else None
     return FiberPoolStatus(
         observed_generation=pool.metadata.generation,
         phase=phase(pool, found, outlook),
@@ -48,11 +306,11 @@ def describe(facts: Assessment, outlook: Outlook, account: Account) -> FiberPool
         terminating_replicas=counts.terminating,
         updated_replicas=counts.updated,
         selector=manifests.selector(pool),
-        endpoint=names.endpoint_of(memory.address) if memory.address else before.endpoint,
-        master=leads_to if memory.led else before.master,
+        endpoint=names.endpoint_of(knowledge.address) if knowledge.address else before.endpoint,
+        master=leads_to if knowledge.led else before.master,
         master_epoch=max(epoch, before.master_epoch or 0) or None,
         idle_since=facts.idleness.since,
-        credentials_secret=before.credentials_secret if memory.credentials is None else secret,
+        credentials_secret=before.credentials_secret if knowledge.credentials is None else secret,
         template_hash=facts.template_hash,
         proven_template_hash=account.proven,
         failures=account.failures,
@@ -63,7 +321,7 @@ def describe(facts: Assessment, outlook: Outlook, account: Account) -> FiberPool
 
 def _connected(outlook: Outlook) -> int | None:
     # What a Lease says may be older than the end of a pod, and is the word of a program.
-    known = outlook.attachment.connected
+    known = outlook.master_state.connected
     return None if known is None else min(known, outlook.counts.live)
 
 
@@ -97,7 +355,7 @@ def describe_unreadable(
         )
         for kind, truth in _TOLD.items()
     ]
-    counts = Counts.of(pods, before.desired_replicas or 0, before.template_hash or "")
+    counts = PodCounts.of(pods, before.desired_replicas or 0, before.template_hash or "")
     known = next((p for p in before.problems if p.reason == Reason.INVALID_SPEC), None)
     problem = Problem(
         reason=Reason.INVALID_SPEC,
@@ -176,3 +434,93 @@ _TOLD: Mapping[ConditionType, Truth] = {
     ConditionType.ACCEPTED: "False",
     ConditionType.DEGRADED: "True",
 }
+
+
+# -- Events of a plan
+
+
+@dataclass(frozen=True)
+class Change:
+    """From one status to the next, and what is done between."""
+
+    before: FiberPoolStatus
+    after: FiberPoolStatus
+    account: Account
+    create: int
+    delete: Sequence[Deletion]
+
+
+def events(change: Change, *, told: bool) -> Iterator[PoolEvent]:
+    """Yield events for actions; then, if the new status is ``told``, for the news in it."""
+    yield from _actions(change)
+    if told:
+        yield from _disruptions(change)
+        yield from _problems(change)
+        yield from _masters(change)
+
+
+_DELETIONS = {
+    Reason.RELEASED: "Deleting workers that the master released",
+    Reason.SCALED_DOWN: "Deleting workers: fewer are wanted",
+    Reason.REPLACED: "Deleting workers of an older template",
+    Reason.COMPLETED: "Deleting workers that had ended with exit code 0",
+    Reason.SUSPENDED: "Deleting workers: the pool is suspended",
+}
+
+
+def _actions(change: Change) -> Iterator[PoolEvent]:
+    # Without numbers: a look follows the other, and what is told again raises a count.
+    reasons = {deletion.reason for deletion in change.delete}
+    for reason, said in _DELETIONS.items():
+        if reason in reasons:
+            yield PoolEvent("Normal", reason, said)
+    if change.create:
+        yield PoolEvent(
+            "Normal", Reason.SCALED_UP, "Creating workers: more are wanted than are there"
+        )
+
+
+def _disruptions(change: Change) -> Iterator[PoolEvent]:
+    disrupted = change.account.disrupted
+    if not disrupted:
+        return
+    pod = disrupted[-1]
+    others = f" and {len(disrupted) - 1} more" if len(disrupted) > 1 else ""
+    words = " ".join(filter(None, (pod.reason, pod.message)))
+    message = f"{pod.name}{others} ended through no fault of its own{messages.quoted(words)}"
+    yield PoolEvent("Normal", Reason.DISRUPTED, f"{message}. A new one takes its place at once")
+
+
+def _problems(change: Change) -> Iterator[PoolEvent]:
+    known = {(problem.reason, problem.severity) for problem in change.before.problems}
+    failed = {pod.name for pod in change.account.failed}
+    for problem in change.after.problems:
+        if (problem.reason, problem.severity) not in known or problem.pod in failed:
+            yield PoolEvent("Warning", problem.reason, _without_output(problem.message))
+    if _was_degraded(change.before) == "True" and _was_degraded(change.after) == "False":
+        yield PoolEvent("Normal", Reason.RECOVERED, "What was wrong with the pool is so no more")
+
+
+def _masters(change: Change) -> Iterator[PoolEvent]:
+    before, after = change.before, change.after
+    if (before.master, before.master_epoch) == (after.master, after.master_epoch):
+        return
+    if after.master:
+        message = f"Workers dial the master at {after.master}, epoch {after.master_epoch}"
+    else:
+        message = "The master has left; the workers wait for the next"
+    yield PoolEvent("Normal", Reason.MASTER_CHANGED, message)
+
+
+def _without_output(message: str) -> str:
+    """Less a worker's last lines.
+
+    They may hold what others must not read, and events and this operator's log end up where
+    everybody looks; the status and the pod's log are read by whoever may read pools and pods.
+    """
+    return message.partition(messages.LAST_LINES)[0]
+
+
+def _was_degraded(status: FiberPoolStatus) -> str:
+    found = (c.status for c in status.conditions if c.type == ConditionType.DEGRADED)
+    return next(found, "Unknown")

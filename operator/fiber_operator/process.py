@@ -1,11 +1,11 @@
-"""The parts of the operator, put together.
+"""Process of the operator: its parts, put together.
 
 ::
 
-    handlers ──► queue ──► controller ──► cluster
-    resync  ────►  ▲          │  ▲            ▲
-    leases  ────────┘         ▼  │            │ permit
-                            planning        elector (Lease of the release: this process acts)
+    watches ───► work queue ──► controller ──► cluster
+    resync  ────►    ▲             │  ▲           ▲
+    master leases ───┘             ▼  │           │ permit
+                                 planning      leader election (may this process act?)
 """
 
 from __future__ import annotations
@@ -18,31 +18,23 @@ from collections.abc import Callable
 from typing import Protocol
 
 from fiber_api import names
-from fiber_operator.cluster import (
-    WRITE_TIMEOUT,
-    Cluster,
-    Permit,
-    load_configuration,
-)
+from fiber_operator.cluster import WRITE_TIMEOUT, Cluster, Permit, load_configuration
 from fiber_operator.controller import Controller
 from fiber_operator.creation import Draw, draw_suffix
-from fiber_operator.event_recorder import EventRecorder
-from fiber_operator.handlers import Configure, Watcher
-from fiber_operator.health import Health
-from fiber_operator.heartbeat import Heartbeat
-from fiber_operator.leader_election import LeaderElector
+from fiber_operator.events import EventRecorder
+from fiber_operator.health import Health, serving
 from fiber_operator.lease_monitor import LeaseMonitor
 from fiber_operator.metrics import Metrics
-from fiber_operator.resync import Resync
-from fiber_operator.server import serving
-from fiber_operator.settings import Settings
-from fiber_operator.watches import Watches
-from fiber_operator.workqueue import Key, Queue, Result
+from fiber_operator.operator_leases import Heartbeat, LeaderElector
+from fiber_operator.settings import OperatorSettings
+from fiber_operator.watches import Configure, KopfThread, Resync, WatchStatus
+from fiber_operator.workqueue import Key, Result, WorkQueue
+
+log = logging.getLogger(__name__)
+
 
 DRAIN = 5.0
 """Seconds that a call under way may take to end when the operator is to stop."""
-
-log = logging.getLogger(__name__)
 
 
 class Part(Protocol):
@@ -51,15 +43,15 @@ class Part(Protocol):
     async def run(self) -> None: ...
 
 
-class Program:
+class OperatorProcess:
     """Operator of one process.  ``watches`` makes the watches, which call ``notice``."""
 
     def __init__(
         self,
-        settings: Settings,
+        settings: OperatorSettings,
         *,
         configure: Configure = load_configuration,
-        watches: Callable[..., Part] = Watcher,
+        watches: Callable[..., Part] = KopfThread,
         now: Callable[[], float] = time.time,
         draw: Draw = draw_suffix,
     ) -> None:
@@ -122,7 +114,7 @@ class Program:
             on_change=self._lease_changed,
             wall_clock=self._now,
         )
-        self.queue = Queue(self._reconcile, concurrency=settings.concurrency)
+        self.queue = WorkQueue(self._reconcile, concurrency=settings.concurrency)
         self.lease_monitor = LeaseMonitor(cluster, lambda key: self.queue.add(key, urgent=True))
         self.recorder = EventRecorder(cluster, self._now, settings.identity)
         self.controller = Controller(
@@ -148,7 +140,7 @@ class Program:
             serves=lambda namespace: self.elector.is_leader and self.resync.lists(namespace),
             wall_clock=self._now,
         )
-        self.watches = Watches(settings.namespaces)
+        self.watches = WatchStatus(settings.namespaces)
         self.health = Health(self.elector, self.queue, self.resync, self.watches, clock)
         self.metrics.watch_queue(self.queue.statistics, lambda: self.elector.is_leader)
 

@@ -1,12 +1,13 @@
-"""Kubernetes events on the pools: what ``kubectl describe`` shows.  Lost ones do no harm.
+"""Kubernetes events: those that the operator posts on pools, and those that it reads of pods.
 
-An event that repeats within ``WINDOW`` raises the count of the one that is there, and not more
-often than every ``PAUSE`` seconds, so that a pool in trouble does not flood the API server.
-What would differ each time, such as a number of pods, is therefore not in the words of an event.
+Posted events are what ``kubectl describe`` shows; a lost one does no harm.  An event that repeats
+within ``WINDOW`` raises the count of the existing one, at most every ``PAUSE`` seconds, so that a
+pool in trouble does not flood the API server.  For that the text of an event holds nothing that
+differs each time, such as a number of pods.
 
-They are posted beside the reconciles, which wait for none.  Namespaces take turns, and each has a
-bound on the events that wait and on those that are remembered: the events of a namespace in trouble
-neither delay nor displace those of another.
+Events are posted beside the reconciles, which do not wait for them.  Namespaces take turns, and
+each has a limit of waiting and of remembered events, so that the events of one namespace neither
+delay nor displace those of another.
 """
 
 from __future__ import annotations
@@ -16,15 +17,22 @@ import datetime
 import logging
 import secrets
 from collections import OrderedDict, deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from fiber_api import names
-from fiber_operator.cluster import EVENTS, ApiError, Body, Cluster
-from fiber_operator.leader_election import NotLeader
+from fiber_operator.cluster import EVENTS, Cluster
 from fiber_operator.logs import about
-from fiber_operator.planning.plans import Event
+from fiber_operator.operator_leases import NotLeader
+from fiber_operator.planning.documents import mapping, seconds, text
+from fiber_operator.planning.plans import PoolEvent
+from fiber_operator.planning.pods import PodView
+from fiber_operator.responses import ApiError, Body
 from fiber_operator.workqueue import Key
+
+log = logging.getLogger(__name__)
+
 
 WINDOW = 600.0
 PAUSE = 30.0
@@ -36,8 +44,6 @@ AT_ONCE = 4
 """Events that are posted at the same time, each of another namespace."""
 MESSAGE_LIMIT = 1024
 """The API server refuses longer ones."""
-
-log = logging.getLogger(__name__)
 
 
 @dataclass
@@ -56,7 +62,9 @@ _Place = tuple[str, str, str]
 class _Namespace:
     """The events of one namespace."""
 
-    waiting: deque[tuple[Key, str, Event]] = field(default_factory=lambda: deque(maxlen=WAITING))
+    waiting: deque[tuple[Key, str, PoolEvent]] = field(
+        default_factory=lambda: deque(maxlen=WAITING)
+    )
     posted: OrderedDict[_Place, _Posted] = field(default_factory=OrderedDict)
     posting: bool = False
 
@@ -80,7 +88,7 @@ class EventRecorder:
         self._namespaces: dict[str, _Namespace] = {}
         """Namespaces in the order of their turns."""
 
-    def tell(self, key: Key, uid: str, event: Event) -> None:
+    def tell(self, key: Key, uid: str, event: PoolEvent) -> None:
         """Log ``event`` and have it posted on the pool when its turn comes."""
         level = logging.WARNING if event.type == "Warning" else logging.INFO
         log.log(level, "%s", event.message, extra=about(*key, uid=uid, reason=event.reason))
@@ -131,7 +139,7 @@ class EventRecorder:
                 del self._namespaces[known]
                 return
 
-    async def record(self, key: Key, uid: str, event: Event) -> None:
+    async def record(self, key: Key, uid: str, event: PoolEvent) -> None:
         """Post ``event`` on the pool; it never fails, it only may not be posted."""
         now, place = self._now(), (uid, event.reason, event.message[:MESSAGE_LIMIT])
         posted = self._events_of(key).posted.get(place)
@@ -144,7 +152,7 @@ class EventRecorder:
         except (ApiError, TimeoutError, NotLeader) as error:
             log.warning("an event could not be posted: %s", error, extra=about(*key, uid=uid))
 
-    async def _post(self, place: _Place, key: Key, event: Event, now: float) -> None:
+    async def _post(self, place: _Place, key: Key, event: PoolEvent, now: float) -> None:
         name = f"{key.name}.{secrets.token_hex(8)}"
         body: Body = {
             "apiVersion": "v1",
@@ -184,3 +192,81 @@ class EventRecorder:
 def _stamp(now: float) -> str:
     moment = datetime.datetime.fromtimestamp(now, datetime.UTC)
     return moment.strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
+# -- Events about pods
+
+_NO_NEWS = frozenset(
+    {
+        # Said before it had a node.
+        "FailedScheduling",
+        "NotTriggerScaleUp",
+        "Scheduled",
+        "TriggeredScaleUp",
+        # Normal events that go along with a trouble and do not end it.
+        "BackOff",
+        "Killing",
+        "SandboxChanged",
+        # A notice of a kubelet that starts the pod all the same.
+        "MissingClusterDNS",
+    }
+)
+"""Reasons of events that say nothing of what a pod with a node waits for."""
+
+
+class _Said(NamedTuple):
+    """Event; the greatest is the newest."""
+
+    second: int
+    """Kubernetes tells most times no better than that."""
+    written: int
+    warning: str
+
+
+async def pod_warnings(
+    cluster: Cluster, key: Key, pods: Sequence[str], there: Sequence[PodView]
+) -> dict[str, str]:
+    """Pod name -> its newest event as ``Reason: message`` if that is a Warning, else empty.
+
+    A Warning that something newer follows is over: the volume is mounted at last, the image is
+    being pulled.
+    """
+    uids = {pod.name: pod.uid for pod in there}
+    found = {}
+    for name in pods:
+        try:
+            events = await cluster.list(
+                EVENTS, key.namespace, _said, fields=f"involvedObject.uid={uids.get(name)}"
+            )
+        except ApiError:
+            events = []  # it would only have been an explanation
+        newest = max((event for event in events if event is not None), default=None)
+        found[name] = newest.warning if newest else ""
+    return found
+
+
+def _said(event: Body) -> _Said | None:
+    reason = text(event.get("reason"))
+    if reason in _NO_NEWS:
+        return None
+    warning = f"{reason}: {text(event.get('message'))}" if event.get("type") == "Warning" else ""
+    return _Said(int(_last_time(event)), _version(event), warning)
+
+
+def _version(event: Body) -> int:
+    """Return a number that is greater for the later of two events of one second."""
+    try:
+        return int(text(mapping(event, "metadata").get("resourceVersion")))
+    except ValueError:
+        return 0
+
+
+def _last_time(event: Body) -> float:
+    """Return when an event happened last: a repeated one is the same object with another time."""
+    stamps = (
+        mapping(event, "series").get("lastObservedTime"),
+        event.get("lastTimestamp"),
+        event.get("eventTime"),
+        mapping(event, "metadata").get("creationTimestamp"),
+    )
+    return next(filter(None, map(seconds, stamps)), 0.0)

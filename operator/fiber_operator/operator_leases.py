@@ -1,12 +1,16 @@
-"""Leader election by a Lease: of several processes of one release, at most one acts.
+"""Leases that the operator itself holds: one to act, and one to show programs that it serves.
 
-Whether somebody else's Lease has run out is judged by this process's monotonic clock, from when it
-last saw the Lease change; clocks of different machines are never compared.  The holder counts its
-own time from before it asked.  It begins nothing after two thirds of it, and gives each write only
-as long as it may last, so that none is under way when others may begin::
+Leader election: of several processes of one release, at most one acts.  Each process judges by its
+monotonic clock whether another process's Lease has expired, from the moment it last saw that Lease
+change.  Clocks of different machines are never compared.  The holder counts its time from before
+its request.  It starts no write after two thirds of that time, and limits each write, so that none
+is under way when another process may begin::
 
-    asked                      nothing begins any more    the last write ends    others may begin
+    request                       the last write starts    the last write ends  others may begin
       |------ 2/3 of the duration ------|-----------------------|-------- 1/10 --------|
+
+The heartbeat locks nothing: each operator that serves a namespace writes the same Lease, and
+programs only look whether it is fresh.
 """
 
 from __future__ import annotations
@@ -14,12 +18,17 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
+from fiber_api import names
 from fiber_api.times import format_micro_time
-from fiber_operator.cluster import LEASES, ApiError, Body, Cluster, Conflict, Gone, Unavailable
+from fiber_operator.cluster import LEASES, Cluster
 from fiber_operator.logs import about
+from fiber_operator.responses import ApiError, Body, Conflict, Gone, Unavailable, complaint
+
+log = logging.getLogger(__name__)
+
 
 HELD_SHARE = 2 / 3
 """Share of the duration for which a renewal lets the holder act."""
@@ -27,8 +36,6 @@ WRITTEN_SHARE = 9 / 10
 """Share of the duration after which its last write has ended.  The rest is for differing clocks."""
 RENEW_SHARE = 1 / 3
 RETRY_SHARE = 1 / 8
-
-log = logging.getLogger(__name__)
 
 
 class NotLeader(Exception):
@@ -214,3 +221,84 @@ class LeaderElector:
 def _spec(lease: Body | None) -> dict[str, Any]:
     spec = lease.get("spec") if lease is not None else None
     return spec if isinstance(spec, dict) else {}
+
+
+# -- The heartbeat
+
+RENEW_SERVING = names.SERVING_SECONDS / 5
+"""Seconds between two renewals."""
+RETRY_SERVING = 1.0
+"""Seconds until the next look where the namespace is not served yet."""
+RETRY_REFUSED = 15.0
+"""Seconds until the next attempt where the Lease could not be written."""
+
+
+class Heartbeat:
+    """Renews the Lease wherever ``serves`` says so.  ``namespaces`` are served; empty: all."""
+
+    def __init__(
+        self,
+        cluster: Cluster,
+        *,
+        namespaces: Sequence[str],
+        identity: str,
+        serves: Callable[[str], bool],
+        wall_clock: Callable[[], float] = time.time,
+    ) -> None:
+        """``serves`` is called with a namespace, or with nothing (all namespaces)."""
+        self._cluster = cluster
+        self._namespaces = tuple(namespaces) or ("",)
+        self._identity = identity
+        self._serves = serves
+        self._wall_clock = wall_clock
+        self._failures: dict[str, str] = {}
+        """Namespace of a Lease -> why it cannot be written."""
+
+    async def run(self) -> None:
+        """Go on until cancelled."""
+        await asyncio.gather(*map(self._keep, self._namespaces))
+
+    async def _keep(self, namespace: str) -> None:
+        while True:
+            await asyncio.sleep(await self._step(namespace))
+
+    async def _step(self, namespace: str) -> float:
+        """Renew the Lease if the namespace is served; returns the seconds until the next step."""
+        if not self._serves(namespace):
+            return RETRY_SERVING
+        where = namespace or names.SERVING_NAMESPACE
+        try:
+            await self._write(where)
+        except ApiError as error:
+            failure = complaint(error)
+            if self._failures.get(where) != failure:
+                log.warning(
+                    "programs with backend='auto' do not find this operator: %s",
+                    failure,
+                    extra=about(where, reason=error.reason),
+                )
+            self._failures[where] = failure
+            return RETRY_REFUSED
+        self._failures.pop(where, None)
+        return RENEW_SERVING
+
+    async def _write(self, where: str) -> None:
+        spec = {
+            "holderIdentity": self._identity,
+            "leaseDurationSeconds": names.SERVING_SECONDS,
+            "renewTime": format_micro_time(self._wall_clock()),
+        }
+        try:
+            await self._cluster.patch(LEASES, where, names.SERVING_LEASE, {"spec": spec})
+        except Gone:
+            await self._cluster.create(LEASES, where, _serving_lease(spec))
+
+
+def _serving_lease(spec: Body) -> Body:
+    labels = {names.LABEL_MANAGED_BY: names.OPERATOR_MANAGER}
+    return {
+        "apiVersion": "coordination.k8s.io/v1",
+        "kind": "Lease",
+        "metadata": {"name": names.SERVING_LEASE, "labels": labels},
+        "spec": spec,
+    }

@@ -1,4 +1,4 @@
-"""Messages of problems: what happened, in the cluster's own words; why; what to do."""
+"""Messages of problems and events: what happened, in the cluster's words; why; what to do."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ from typing import Any
 from fiber_api import names
 from fiber_api.names import Reason
 from fiber_api.times import format_time
-from fiber_api.v1alpha1 import Failures, FiberPool, Master
+from fiber_api.v1alpha1 import Failures, FiberPool, MasterSpec
 from fiber_operator.planning.documents import items, mapping, text
-from fiber_operator.planning.plans import LeaseVerdict, Refusal
+from fiber_operator.planning.plans import LeaseVerdict, Obstacle, PodRefusal
 from fiber_operator.planning.pods import PodView
+from fiber_operator.responses import ApiError, Invalid, Refused
 
 _SIGNALS = {4: "SIGILL", 6: "SIGABRT", 7: "SIGBUS", 8: "SIGFPE", 9: "SIGKILL", 11: "SIGSEGV"}
 _SIGNALS |= {1: "SIGHUP", 2: "SIGINT", 15: "SIGTERM"}
@@ -264,7 +265,7 @@ def limit_exceeded(pool: FiberPool, failures: Failures, last: str) -> str:
 # -- What the API server refuses
 
 
-def refusal(reason: Reason, refused: Refusal) -> str:
+def refusal(reason: Reason, refused: PodRefusal) -> str:
     """A pod that the API server does not take."""
     what, remedy = _REFUSALS[reason]
     # The pod that it names never was, and is called differently at each attempt.
@@ -355,7 +356,7 @@ def no_lease(pool: FiberPool) -> str:
     )
 
 
-def _whereabouts(master: Master) -> str:
+def _whereabouts(master: MasterSpec) -> str:
     where = names.address_of(master.host, master.port)
     return f"{where} ({master.identity}, epoch {master.epoch})"
 
@@ -388,3 +389,89 @@ def foreign_releases(pool: FiberPool, foreign: list[str]) -> str:
         "Nothing is deleted for these. Workers are called "
         f"{pool.metadata.name}-<{names.POD_SUFFIX_LENGTH} hexadecimal digits>."
     )
+
+
+# -- Failed calls of the API server
+
+_RIGHTS = (
+    "Give the operator's account this right, as the chart's roles do, or change the policy or the "
+    "quota that forbids it; the operator tries again by itself."
+)
+_WEBHOOKS = (
+    "The operator tries again by itself. If this stays, look for an admission webhook for {what} "
+    "that is down or slow (kubectl get mutatingwebhookconfigurations,"
+    "validatingwebhookconfigurations), and at the API server itself."
+)
+_SCHEMA = "Bring the CustomResourceDefinition of FiberPools to the operator's release."
+_SERVER = "The operator tries again by itself; if this stays, look at the API server."
+
+
+def object_obstacle(error: ApiError, what: str) -> Obstacle:
+    """An object that the pool needs could not be had; ``what`` names it."""
+    if isinstance(error, Refused):
+        return _forbidden(error, f"for {what}")
+    if isinstance(error, Invalid):
+        message = (
+            f"The API server refuses to {error.call} for {what}{quoted(error.message)}. The pool "
+            "needs it: remove what refuses it, a policy or a webhook for instance."
+        )
+        return Obstacle(Reason.FORBIDDEN, message)
+    remedy = _WEBHOOKS.format(what=error.call.split()[-1]) if error.writes else _SERVER
+    message = (
+        f"The call to {error.call} for {what} failed{quoted(error.message)}. Workers that run go "
+        f"on; none is made meanwhile. {remedy}"
+    )
+    return Obstacle(Reason.API_UNAVAILABLE, message)
+
+
+def creation_obstacle(error: ApiError) -> Obstacle:
+    """Return the obstacle after a failed creation of a pod."""
+    message = (
+        f"The API server does not make workers{quoted(error.message)}. Those that run go on. "
+        f"{_WEBHOOKS.format(what='pods')}"
+    )
+    return Obstacle(Reason.API_UNAVAILABLE, message)
+
+
+def deletion_obstacle(error: ApiError) -> Obstacle:
+    """Return the obstacle after a failed deletion."""
+    if isinstance(error, Refused | Invalid):
+        return _forbidden(error, "to remove what is not wanted any more")
+    message = (
+        f"The call to {error.call} failed{quoted(error.message)}, and what is not wanted any more "
+        f"is still there. {_WEBHOOKS.format(what=error.call.split()[-1])}"
+    )
+    return Obstacle(Reason.API_UNAVAILABLE, message)
+
+
+def list_obstacle(error: ApiError) -> Obstacle:
+    """Return the obstacle after a failed list of pods."""
+    blind = "Until they are known none is made or deleted, and the numbers are those of before."
+    if isinstance(error, Refused | Invalid):
+        return _forbidden(error, "to see the pool's workers", blind)
+    message = f"The pool's workers cannot be listed{quoted(error.message)}. {blind} {_SERVER}"
+    return Obstacle(Reason.API_UNAVAILABLE, message)
+
+
+def unreadable_lease(pool: FiberPool, words: str) -> str:
+    """Return the words for a Lease that cannot be read."""
+    lease = pool.spec.master.lease_name if pool.spec.master else None
+    return (
+        f"The operator may not get leases, so that nobody sees whether the master renews the Lease "
+        f"{lease}{quoted(words)}. Until then onLost ({pool.spec.on_lost}) is never applied"
+        f", and a pool whose master is gone stays. {_RIGHTS}"
+    )
+
+
+def unwritable_status(error: ApiError) -> str:
+    """The status cannot be written; an event is all that is left to tell it."""
+    remedy = _RIGHTS if isinstance(error, Refused) else _SCHEMA
+    return (
+        f"What the status of this pool says is out of date: {error}. Nothing is made or deleted "
+        f"until it can be written. {remedy}"
+    )
+
+
+def _forbidden(error: ApiError, purpose: str, effect: str = "") -> Obstacle:
+    what = f"The operator may not {error.call}, which it needs {purpose}{quoted(error.message)}."
+    return Obstacle(Reason.FORBIDDEN, " ".join(filter(None, (what, effect, _RIGHTS))))

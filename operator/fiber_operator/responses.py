@@ -1,0 +1,255 @@
+"""Responses of the API server: documents, lists and errors.
+
+Each error is one of these classes, by which a caller decides what to do::
+
+    ApiError
+    ├── Gone         404  the object does not exist
+    ├── Conflict     409  the name is taken, or a precondition does not hold
+    ├── Refused      403  quota, policy, or a missing right
+    ├── Invalid      400, 422 and the rest of 4xx: a retry will not help
+    └── Unavailable  the outcome is not known: 5xx, no connection, timeout, a garbled answer
+        └── TooMany  429  retry after ``retry_after`` seconds
+
+``ListReader`` decodes a list one object at a time while the response arrives, so that neither the
+response nor its text is in memory as a whole.  A character takes four bytes once there is an emoji
+near it, and objects of a megabyte are possible.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import codecs
+import json
+import re
+from collections.abc import AsyncIterator, Mapping
+from typing import Any
+
+Body = dict[str, Any]
+
+LONGEST_RETRY_AFTER = 60.0
+_MESSAGE_LIMIT = 2000
+
+
+class ApiError(Exception):
+    """A call that did not succeed.  ``str`` says what was asked and what came back."""
+
+    def __init__(self, message: str, *, what: str = "", status: int = 0, reason: str = "") -> None:
+        super().__init__(f"{what}: {message}" if what else message)
+        self.message = message
+        """The API server's own words."""
+        self.call = " ".join(what.split()[:2])
+        """Verb and resource, as a right names them: ``get secrets``."""
+        self.status = status
+        self.reason = reason
+        """The API server's word for the error, ``AlreadyExists`` for example."""
+
+    @property
+    def writes(self) -> bool:
+        """True if the call changes something, and so passes admission webhooks."""
+        return not self.call.startswith(("get ", "list "))
+
+
+class Gone(ApiError):
+    """The object does not exist."""
+
+
+class Conflict(ApiError):
+    """The name is taken, or the object is not the one that was meant."""
+
+
+class Refused(ApiError):
+    """A quota, a policy or a missing right forbids it."""
+
+
+class Invalid(ApiError):
+    """The API server cannot accept this, now or later."""
+
+
+class Unavailable(ApiError):
+    """The call had no answer, and may have been carried out."""
+
+
+class TooMany(Unavailable):
+    """The API server asks to come back after ``retry_after`` seconds."""
+
+    def __init__(self, message: str, *, retry_after: float, **about: Any) -> None:
+        super().__init__(message, **about)
+        self.retry_after = retry_after
+
+
+def complaint(error: ApiError) -> str:
+    """Return what went wrong, and what to do if that is known."""
+    if isinstance(error, Refused):
+        return f"{error}. Give the operator's account this right: the chart's roles have it"
+    return str(error)
+
+
+def object_of(answer: Body, name: str, what: str) -> Body:
+    """``answer`` if it is the object of that name: what is none must not be taken for one."""
+    metadata = answer.get("metadata")
+    if not isinstance(metadata, dict) or metadata.get("name") != name:
+        raise Unavailable(f"the answer is not the object {name}", what=what)
+    return answer
+
+
+def document_of(status: int, headers: Mapping[str, str], data: bytes, what: str) -> Body:
+    """The document in an answer; what is no success is raised."""
+    try:
+        body = json.loads(data)
+    except (ValueError, RecursionError):
+        body = None
+    if 200 <= status < 300:
+        if isinstance(body, dict):
+            return body
+        # Not shown: it may be half a Secret.
+        raise Unavailable(f"the answer is no JSON object ({len(data)} bytes)", what=what)
+    raise _error(status, headers, body if isinstance(body, dict) else {}, data, what)
+
+
+def _error(status: int, headers: Mapping[str, str], body: Body, data: bytes, what: str) -> ApiError:
+    message = str(body.get("message") or "") or _excerpt(data) or f"HTTP status {status}"
+    about: dict[str, Any] = {
+        "what": what,
+        "status": status,
+        "reason": str(body.get("reason") or ""),
+    }
+    message = message[:_MESSAGE_LIMIT]
+    if status == 429:
+        return TooMany(message, retry_after=_retry_after(headers), **about)
+    # Without a Status it was not the API server that answered but something on the way to it.
+    if status >= 500 or status in (401, 408, 410) or body.get("kind") != "Status":
+        return Unavailable(message, **about)
+    return {404: Gone, 409: Conflict, 403: Refused}.get(status, Invalid)(message, **about)
+
+
+def _retry_after(headers: Mapping[str, str]) -> float:
+    try:
+        seconds = float(headers.get("Retry-After", ""))
+    except ValueError:
+        return 1.0
+    return min(max(seconds, 0.1), LONGEST_RETRY_AFTER) if seconds == seconds else 1.0
+
+
+def _excerpt(data: bytes) -> str:
+    return data[:200].decode(errors="replace").strip()
+
+
+# -- Lists
+
+PIECE = 2**16
+"""Bytes that are read at least before others may go on: some 16 pods."""
+METADATA_LIST = "PartialObjectMetadataList"
+
+_SPACE = re.compile(r"[ \t\n\r]*")
+_decode = json.JSONDecoder().raw_decode
+
+
+class ListReader:
+    """The answer to a list.  Iterate over its objects first, then ask ``more``.
+
+    Strict, because a list that is taken for empty by mistake makes the operator create pods: an
+    answer that is not a whole list of objects raises Unavailable, at its end at the latest.
+    """
+
+    def __init__(self, pieces: AsyncIterator[bytes], what: str) -> None:
+        self._pieces = pieces
+        self._what = what
+        self._decoder = codecs.getincrementaldecoder("utf-8")()
+        self._text = ""
+        self._at = 0
+        self._ended = False
+        self._items: object = None
+        self.rest: Body = {}
+        """The members of the list beside its items."""
+
+    async def __aiter__(self) -> AsyncIterator[Body]:
+        try:
+            async for item in self._objects():
+                yield item
+        except (ValueError, RecursionError):
+            # Not shown: it may be half a Secret.
+            raise Unavailable("the answer is no JSON object", what=self._what) from None
+        kind = str(self.rest.get("kind", ""))
+        # The API server has null for the items of an empty list of metadata.
+        has_items = self._items is list or (kind == METADATA_LIST and "items" in self.rest)
+        if not (
+            kind.endswith("List") and has_items and isinstance(self.rest.get("metadata"), dict)
+        ):
+            raise Unavailable("the answer is no list of objects", what=self._what)
+
+    def more(self) -> str:
+        """Return the token of the next page; empty if this was the last."""
+        return str(self.rest["metadata"].get("continue") or "")
+
+    async def _objects(self) -> AsyncIterator[Body]:
+        async for _ in self._parts("{", "}"):
+            key = await self._value()
+            await self._take(":")
+            if key == "items" and await self._peek() == "[":
+                self._items = list
+                async for _ in self._parts("[", "]"):
+                    item = await self._value()
+                    if not isinstance(item, dict):
+                        raise Unavailable("the answer is no list of objects", what=self._what)
+                    yield item
+                    del item
+            else:
+                self.rest[str(key)] = await self._value()
+        if await self._peek():
+            raise ValueError("more than one document")
+
+    async def _parts(self, start: str, end: str) -> AsyncIterator[None]:
+        """Yield once for each part between the brackets; the caller reads the part."""
+        await self._take(start)
+        if await self._peek() == end:
+            await self._take(end)
+            return
+        while True:
+            yield
+            if await self._peek() == end:
+                await self._take(end)
+                return
+            await self._take(",")
+
+    async def _value(self) -> Any:
+        while True:
+            first = await self._peek()
+            try:
+                value, end = _decode(self._text, self._at)
+            except ValueError:
+                if not await self._read_on():
+                    raise
+                continue
+            if end == len(self._text) and first not in '{["' and await self._read_on():
+                continue  # half a number is a number
+            self._at = end
+            return value
+
+    async def _peek(self) -> str:
+        """Return the next character that is no space; empty at the end."""
+        while True:
+            space = _SPACE.match(self._text, self._at)
+            self._at = space.end() if space else self._at
+            if self._at < len(self._text) or not await self._read_on():
+                return self._text[self._at : self._at + 1]
+
+    async def _take(self, expected: str) -> None:
+        if await self._peek() != expected:
+            raise ValueError("not what is expected")
+        self._at += 1
+
+    async def _read_on(self) -> bool:
+        """Read as much again as is left of the text, so that a large object is tried few times."""
+        if self._ended:
+            return False
+        await asyncio.sleep(0)
+        parts = [self._text[self._at :]]
+        self._text, self._at = "", 0
+        wanted = len(parts[0]) or 1
+        while wanted > 0 and not self._ended:
+            piece = await anext(self._pieces, b"")
+            self._ended = not piece
+            parts.append(self._decoder.decode(piece, final=self._ended))
+            wanted -= len(parts[-1])
+        self._text = "".join(parts)
+        return True
