@@ -38,7 +38,7 @@ def main(arguments: Sequence[str]) -> int:
             rounds.play(cases, able, options.rounds)
         except KeyboardInterrupt:
             signal.signal(signal.SIGINT, signal.SIG_IGN)
-            say("interrupted: stopping the contenders; nothing is written")
+            say("interrupted: stopping the contenders; no page is written")
             return 130
         finally:
             rounds.abandon()

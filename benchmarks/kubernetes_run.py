@@ -70,7 +70,7 @@ def _measure(runs: dict[str, Run], able: list[Contender], options: argparse.Name
             rounds.play(kubernetes_report.cases(options.size), able, options.rounds)
         except KeyboardInterrupt:
             signal.signal(signal.SIGINT, signal.SIG_IGN)
-            say("interrupted: stopping the contenders; nothing is written")
+            say("interrupted: stopping the contenders; no page is written")
             raise
         finally:
             rounds.abandon()

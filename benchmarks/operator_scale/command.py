@@ -67,7 +67,7 @@ def guarded(measure: Callable[[contextlib.ExitStack], Callable[[], None]]) -> in
         with contextlib.ExitStack() as stack:
             write = measure(stack)
     except KeyboardInterrupt:
-        say("everything is removed; nothing is written")
+        say("everything is removed; no page is written")
         return 130
     except _TROUBLE as error:
         say(f"not measured: {error}")

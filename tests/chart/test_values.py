@@ -127,7 +127,7 @@ def test_a_wrong_value_is_refused_by_name(helm: Helm, values: dict[str, Any], wo
         (
             {"namespaces": ["team-a"]},
             "namespaces is set (team-a), but scope is cluster: the operator would watch every "
-            "namespace all the same. Set scope=namespaced, or leave namespaces empty.",
+            "namespace. Set scope=namespaced, or leave namespaces empty.",
         ),
         (
             {"serviceAccount": {"create": False}},
@@ -171,7 +171,7 @@ def test_a_wrong_value_is_refused_by_name(helm: Helm, values: dict[str, Any], wo
         ),
         (
             {"extraEnv": [{"name": "https_proxy", "value": "http://proxy:3128"}]},
-            "extraEnv sets https_proxy: the operator calls the API server alone",
+            "extraEnv sets https_proxy: the operator calls only the API server",
         ),
         (
             {"extraEnv": [{"name": "A", "value": ""}, {"name": "A", "value": "1"}]},

@@ -1,13 +1,13 @@
 {{/*
-Values that are each right but contradict each other. values.schema.json refuses what is wrong by itself. All
-contradictions are told at once, each with what, why and what to do.
+Checks of values that are valid but contradict each other. values.schema.json refuses invalid values. All
+contradictions are reported at once: what, why, and what to do.
 */}}
 {{- define "fiber-operator.check" -}}
 {{- $faults := list -}}
 {{- with .Values -}}
 
 {{- if and (eq .scope "cluster") .namespaces -}}
-{{- $faults = append $faults (printf "namespaces is set (%s), but scope is cluster: the operator would watch every namespace all the same. Set scope=namespaced, or leave namespaces empty." (join ", " .namespaces)) -}}
+{{- $faults = append $faults (printf "namespaces is set (%s), but scope is cluster: the operator would watch every namespace. Set scope=namespaced, or leave namespaces empty." (join ", " .namespaces)) -}}
 {{- end -}}
 
 {{- if and (not .serviceAccount.create) (empty .serviceAccount.name) -}}
@@ -40,7 +40,7 @@ contradictions are told at once, each with what, why and what to do.
 
 {{- with .metrics.serviceMonitor -}}
 {{- if gt (int .timeoutSeconds) (int .intervalSeconds) -}}
-{{- $faults = append $faults (printf "metrics.serviceMonitor.timeoutSeconds is %v, but intervalSeconds is %v: Prometheus refuses to wait for an answer until after it has asked again. Lower the one or raise the other." .timeoutSeconds .intervalSeconds) -}}
+{{- $faults = append $faults (printf "metrics.serviceMonitor.timeoutSeconds is %v, but intervalSeconds is %v: Prometheus refuses a timeout above the interval. Lower the timeout or raise the interval." .timeoutSeconds .intervalSeconds) -}}
 {{- end -}}
 {{- end -}}
 
@@ -55,7 +55,7 @@ contradictions are told at once, each with what, why and what to do.
 {{- range $value, $labels := dict "commonLabels" .commonLabels "podLabels" .podLabels "metrics.serviceMonitor.labels" .metrics.serviceMonitor.labels "metrics.prometheusRule.labels" .metrics.prometheusRule.labels "metrics.dashboard.labels" .metrics.dashboard.labels -}}
 {{- range $label, $_ := $labels -}}
 {{- if or (hasPrefix "app.kubernetes.io/" $label) (hasPrefix "helm.sh/" $label) -}}
-{{- $faults = append $faults (printf "%s sets %s: the chart sets that label itself, and finds the operator's pod by such labels. Use a label of your own; nameOverride changes app.kubernetes.io/name." $value $label) -}}
+{{- $faults = append $faults (printf "%s sets %s: the chart sets that label itself, and finds the operator's pod by such labels. Use another label; nameOverride changes app.kubernetes.io/name." $value $label) -}}
 {{- end -}}
 {{- end -}}
 {{- end -}}
@@ -68,7 +68,7 @@ contradictions are told at once, each with what, why and what to do.
 {{- $request := index (default dict $.Values.resources.requests) $name -}}
 {{- if and (not (kindIs "invalid" $request)) (not (kindIs "invalid" $limit)) -}}
 {{- if lt (include "fiber-operator.amount" $limit | float64) (include "fiber-operator.amount" $request | float64) -}}
-{{- $faults = append $faults (printf "resources.limits.%s is %v, but resources.requests.%s is %v: Kubernetes refuses a container that asks for more than it may have. Raise the one or lower the other." $name $limit $name $request) -}}
+{{- $faults = append $faults (printf "resources.limits.%s is %v, but resources.requests.%s is %v: Kubernetes refuses a container that asks for more than it may have. Raise the limit or lower the request." $name $limit $name $request) -}}
 {{- end -}}
 {{- end -}}
 {{- end -}}
@@ -76,14 +76,14 @@ contradictions are told at once, each with what, why and what to do.
 {{- $names := list -}}
 {{- range .extraEnv -}}
 {{- if has .name $names -}}
-{{- $faults = append $faults (printf "extraEnv sets %s twice: only one of the two would hold. Take one out." .name) -}}
+{{- $faults = append $faults (printf "extraEnv sets %s twice: only one of the two would apply. Remove one." .name) -}}
 {{- end -}}
 {{- $names = append $names .name -}}
 {{- if regexMatch "(?i)^(https?|all|no)_proxy$" .name -}}
-{{- $faults = append $faults (printf "extraEnv sets %s: the operator calls the API server alone, and uses no proxy for that. Take it out; a registry's proxy is a matter of the nodes." .name) -}}
+{{- $faults = append $faults (printf "extraEnv sets %s: the operator calls only the API server, and uses no proxy for that. Remove the variable; the nodes set a registry's proxy." .name) -}}
 {{- end -}}
 {{- if hasPrefix "FIBER_OPERATOR_" .name -}}
-{{- $faults = append $faults (printf "extraEnv sets %s: the chart derives the operator's settings from scope, operator and metrics, and rights and probes must agree with them. Set the value that stands for it instead." .name) -}}
+{{- $faults = append $faults (printf "extraEnv sets %s: the chart derives the operator's settings from scope, operator and metrics, and rights and probes must agree with them. Set the chart's value instead." .name) -}}
 {{- end -}}
 {{- end -}}
 
@@ -94,7 +94,7 @@ contradictions are told at once, each with what, why and what to do.
 {{- end -}}
 
 {{- with include "fiber-operator.otherOwner" . -}}
-{{- $faults = append $faults (printf "crds.install is true, but the resource type FiberPool belongs to release %s, which runs and installs it too: each upgrade of the one would undo the other's. Set crds.install=false here; or first there, and then add --take-ownership here." .) -}}
+{{- $faults = append $faults (printf "crds.install is true, but the resource type FiberPool belongs to release %s, which runs and installs it too: each upgrade of one release would undo the other's. Set crds.install=false here. Or set it there first, and then add --take-ownership here." .) -}}
 {{- end -}}
 
 {{- if $faults -}}

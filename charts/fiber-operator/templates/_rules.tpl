@@ -5,14 +5,14 @@ calls that the operator makes, both ways.
   pools    the operator, in each namespace that it watches
   own      the operator, in its own namespace: the Lease that keeps two of its processes from acting at once
   serving  the operator, where it shows that it serves: in each namespace that it watches, or in kube-public for all
-  anyone   everybody who is logged in, in kube-public: whether an operator serves all namespaces
-  user     programs that are masters: what the SDK calls, and nothing else
+  anyone   all accounts, in kube-public: to see whether an operator serves all namespaces
+  user     programs that are masters: exactly the calls of the SDK
   viewer   people who only look
   smoke    the helm test
 */}}
 {{- define "fiber-operator.rules" -}}
 pools:
-  # Delete: a pool that says so goes when its master is lost. Its spec is never written.
+  # Delete: a pool with onLost Delete is deleted when its master is lost. The spec is never written.
   - apiGroups: [fiber.dev]
     resources: [fiberpools]
     verbs: [delete, get, list, watch]
@@ -70,8 +70,8 @@ user:
   - apiGroups: [fiber.dev]
     resources: [fiberpools]
     verbs: [create, delete, get, list, patch, watch]
-  # A master makes the credentials of its pool itself. It may read no Secret: for a pool that is somebody else's, give it
-  # the right to get that pool's one by name (docs/fiberpools.md).
+  # A master makes the credentials of its pool itself. It may read no Secret. For a pool of another owner, give it the
+  # right to get that pool's Secret by name (docs/fiberpools.md).
   - apiGroups: [""]
     resources: [secrets]
     verbs: [create]
