@@ -1,4 +1,4 @@
-"""The logger ``fiber``.  Its records go where multiprocessing's go, once that has a logger."""
+"""The logger ``fiber``, a child of multiprocessing's logger once that exists."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from typing import Any
 _mp: Any = util  # typeshed does not list its private names
 
 USUAL = "WARNING"
-"""The level that nothing has to be done for."""
+"""Level at which Fiber sets up no handler."""
 
 
 def debug(message: str, *args: object) -> None:
-    """Log an event of Fiber's; free of cost where ``logging`` is not imported."""
+    """Log an event.  Does nothing if ``logging`` is not imported."""
     # Another thread may be importing the module at this moment.
     get_logger: Any = getattr(sys.modules.get("logging"), "getLogger", None)
     if get_logger is None:
         return
     logger = get_logger("fiber")
     if _mp._logger is not None:
-        logger.parent = _mp._logger  # its level and handlers count from here on
+        logger.parent = _mp._logger  # from now on its level and handlers count
     try:
         logger.debug(message, *args)
-    except Exception:  # of a handler of the user's: Fiber's own threads go on
+    except Exception:  # an error of the user's handler must not end Fiber's threads
         import traceback
 
         with contextlib.suppress(Exception):

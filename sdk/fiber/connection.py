@@ -1,8 +1,8 @@
-"""``Connection``, ``Pipe`` and ``wait``: multiprocessing's, over message channels.
+"""``Connection``, ``Pipe`` and ``wait`` as in multiprocessing, over message channels.
 
-``Listener``, ``Client`` and what belongs to them, ``families`` or ``CHALLENGE`` for instance, are
-multiprocessing's own: they meet other programs.  With an ``authkey`` both sides prove that they
-know it, or get an AuthenticationError.
+``Listener``, ``Client`` and their constants, ``families`` or ``CHALLENGE`` for instance, are
+multiprocessing's objects, since they connect to other programs.  With an ``authkey`` both sides
+prove that they know it, or get an AuthenticationError.
 
 A message arrives whole.  Large contiguous buffers (NumPy arrays) are not copied into the pickle.
 """
@@ -65,7 +65,7 @@ if TYPE_CHECKING:
     def wait(object_list: Iterable[_Waitable], timeout: float | None = None) -> list[_Waitable]: ...
 
     def wait(object_list: Iterable[Any], timeout: float | None = None) -> list[Any]:
-        """multiprocessing's, whose own types know no connections but its own."""
+        """Wait as in multiprocessing, whose types know only its connections."""
 
 else:  # a type checker would accept any name
 
@@ -76,10 +76,10 @@ else:  # a type checker would accept any name
 
 
 _LAST_MOMENT = 0.05
-"""Seconds from the end of a connection to that of the process that held it, at most."""
+"""Seconds, at most, from the end of a connection to the end of its holder's process."""
 
 _NEWS = 2.0
-"""Seconds that news of an end may take on a busy machine."""
+"""Seconds that the report of an end may take on a busy machine."""
 
 _PF_EXITING = 0x4
 """Bit of the flags in /proc/PID/stat, from Linux's ``include/linux/sched.h``."""
@@ -110,7 +110,7 @@ class Connection(Generic[_Sent_contra, _Received_co]):
         channel.send(*_encoded(obj))
 
     def _send_unconfirmed(self, obj: Any) -> None:
-        """``send`` without waiting for another host's answer: an error may come with the next."""
+        """Send without waiting for another host's answer: the next call may raise the error."""
         channel = self._channel
         if channel is None or not self._writable:
             raise self._misuse("read-only")
@@ -130,7 +130,7 @@ class Connection(Generic[_Sent_contra, _Received_co]):
     # Receiving
 
     def recv(self) -> _Received_co:
-        """The next object."""
+        """Return the next object; wait until there is one."""
         channel = self._channel
         if channel is None or not self._readable:
             raise self._misuse("write-only")
@@ -141,15 +141,19 @@ class Connection(Generic[_Sent_contra, _Received_co]):
             raise self._explained(error) from None
 
     def _recv_pickled(self) -> Message:
-        """The next object, not unpickled.  It is copied or let go of soon: large arrays may stay in
-        the memory of their sender.
+        """Return the next object, not unpickled.
+
+        The caller soon copies or drops it.  So large arrays may stay in the memory of the sender.
         """
         if self._channel is None:
             raise self._misuse()
         return self._channel.recv(passing=True)
 
     def recv_bytes(self, maxlength: int | None = None) -> bytes:
-        """The next message as bytes; OSError, and the connection closed, if it is longer."""
+        """Return the next message as bytes.
+
+        If it is longer than ``maxlength``, close the connection and raise OSError.
+        """
         if maxlength is not None and maxlength < 0:
             raise ValueError("negative maxlength")
         data = _as_bytes(self._receive())
@@ -159,8 +163,9 @@ class Connection(Generic[_Sent_contra, _Received_co]):
         return data
 
     def recv_bytes_into(self, buf: Any, offset: int = 0) -> int:
-        """Put the next message into ``buf`` and return its length; BufferTooShort holds what did
-        not fit.
+        """Write the next message into ``buf`` and return its length.
+
+        BufferTooShort, which has the whole message, if it does not fit.
         """
         view = memoryview(buf)
         room = view.itemsize * len(view)
@@ -191,7 +196,7 @@ class Connection(Generic[_Sent_contra, _Received_co]):
             raise self._explained(error) from None
 
     def _explained(self, error: ConnectionClosed) -> ConnectionClosed:
-        """The end of the connection, with how the process that held the other end ended."""
+        """Return the error, with the reason for the end of the other end's process."""
         if error.reason:
             return error
         for reference in reversed(self._other_given_to):
@@ -201,16 +206,16 @@ class Connection(Generic[_Sent_contra, _Received_co]):
                 return ConnectionClosed(process.name, reason)
         return error
 
-    # The end itself
+    # State
 
     def fileno(self) -> int:
-        """A descriptor that is readable when there is something to receive."""
+        """Return a descriptor that is readable when a message can be received."""
         if self._channel is None:
             raise self._misuse()
         return self._channel.fileno()
 
     def close(self) -> None:
-        """Let go of this end."""
+        """Close this end."""
         channel, self._channel = self._channel, None
         if channel is not None:
             channel.close()
@@ -265,7 +270,10 @@ def _rebuild(handle: handles.Handle, readable: bool, writable: bool) -> Connecti
 
 
 def Pipe(duplex: bool = True) -> tuple[Connection, Connection]:
-    """Two connected ends; without ``duplex`` the first only receives and the second only sends."""
+    """Return two connected ends.
+
+    Without ``duplex`` the first end only receives and the second only sends.
+    """
     one, other = UnixChannel.pair() if duplex else one_way.pair()
     first = Connection(one, writable=duplex)
     second = Connection(other, readable=duplex)
@@ -274,12 +282,12 @@ def Pipe(duplex: bool = True) -> tuple[Connection, Connection]:
 
 
 def how_it_ended(process: Any) -> str | None:
-    """Return how a child ended whose end of a connection has closed; None if it still runs."""
+    """Return how a child ended that held an end of a connection; None if it still runs."""
     popen = getattr(process, "_popen", None)
     if popen is None:
         return None
-    # The parent hears of a death moments after the kernel has closed what the process held.
-    # On another host its pid is another process's, or nobody's: there is nothing to look at.
+    # The report of a death follows moments after the kernel has closed the process's descriptors.
+    # The pid of a process on another host means nothing here, so it is not looked at.
     if popen.wait(_LAST_MOMENT) is None and (not popen.same_pids or _is_exiting(popen.pid)):
         popen.wait(_NEWS)
     return None if popen.report is None else popen.report.describe()
@@ -304,7 +312,7 @@ def _is_exiting(pid: int | None) -> bool:
 def _as_bytes(message: Message) -> bytes:
     if not message.buffers:
         return message.tobytes()
-    # It was sent by ``send``; whoever asks for bytes expects one pickle.
+    # The sender used ``send``.  A reader of bytes expects one pickle.
     return pickle.dumps(packet.loads(message), protocol=5)
 
 

@@ -93,34 +93,34 @@ class BaseContext:
         return f"fiber.get_context({self._method!r})" if self._method else "fiber"
 
     def cpu_count(self) -> int:
-        """Processors that this process may use: its affinity and its cgroup's quota are heeded."""
+        """Return the number of processors that its affinity and its cgroup's quota allow."""
         return cpu.cpu_count()
 
     # Communication
 
     def Pipe(self, duplex: bool = True) -> tuple[Connection[Any, Any], Connection[Any, Any]]:
-        """Two connected ends of a pipe."""
+        """Return two connected ends of a pipe."""
         from fiber.connection import Pipe
 
         config.use()
         return Pipe(duplex)
 
     def Queue(self, maxsize: int = 0) -> Queue[Any]:
-        """A queue for any number of processes."""
+        """Return a queue for any number of processes."""
         from fiber.queues import Queue
 
         config.use()
         return Queue(maxsize)
 
     def JoinableQueue(self, maxsize: int = 0) -> JoinableQueue[Any]:
-        """A queue whose items are accounted for by ``task_done`` and ``join``."""
+        """Return a queue with ``task_done`` and ``join``."""
         from fiber.queues import JoinableQueue
 
         config.use()
         return JoinableQueue(maxsize)
 
     def SimpleQueue(self) -> SimpleQueue[Any]:
-        """A queue without a feeder thread."""
+        """Return a queue without a feeder thread."""
         from fiber.queues import SimpleQueue
 
         config.use()
@@ -129,28 +129,28 @@ class BaseContext:
     # Synchronization
 
     def Lock(self) -> Lock:
-        """A mutex."""
+        """Return a mutex."""
         from fiber.synchronize import Lock
 
         config.use()
         return Lock()
 
     def RLock(self) -> RLock:
-        """A mutex that its thread may acquire again."""
+        """Return a mutex that its holder may acquire again."""
         from fiber.synchronize import RLock
 
         config.use()
         return RLock()
 
     def Event(self) -> Event:
-        """A flag to wait for."""
+        """Return a flag to wait for."""
         from fiber.synchronize import Event
 
         config.use()
         return Event()
 
     def Condition(self, lock: LockLike | None = None) -> Condition:
-        """A lock, and those who wait until others notify them."""
+        """Return a condition: a lock whose holders may wait and notify."""
         from fiber.synchronize import Condition
 
         config.use()
@@ -162,21 +162,21 @@ class BaseContext:
         action: Callable[[], object] | None = None,
         timeout: float | None = None,
     ) -> Barrier:
-        """A point at which some threads or processes wait for each other."""
+        """Return a barrier, at which threads of any process wait for each other."""
         from fiber.synchronize import Barrier
 
         config.use()
         return Barrier(parties, action, timeout)
 
     def Semaphore(self, value: int = 1) -> Semaphore:
-        """A semaphore."""
+        """Return a semaphore."""
         from fiber.synchronize import Semaphore
 
         config.use()
         return Semaphore(value)
 
     def BoundedSemaphore(self, value: int = 1) -> BoundedSemaphore:
-        """A semaphore that is never released more often than acquired."""
+        """Return a semaphore that cannot be released more often than it was acquired."""
         from fiber.synchronize import BoundedSemaphore
 
         config.use()
@@ -208,7 +208,7 @@ class BaseContext:
     ) -> Any: ...
 
     def Value(self, typecode_or_type: Any, *args: Any, lock: Any = True) -> Any:
-        """A ctypes object in shared memory, with a lock."""
+        """Return a ctypes object in shared memory, with a lock."""
         from fiber.sharedctypes import Value
 
         config.use()
@@ -248,7 +248,7 @@ class BaseContext:
     ) -> Any: ...
 
     def Array(self, typecode_or_type: Any, size_or_initializer: Size, *, lock: Any = True) -> Any:
-        """A ctypes array in shared memory, with a lock."""
+        """Return a ctypes array in shared memory, with a lock."""
         from fiber.sharedctypes import Array
 
         config.use()
@@ -261,7 +261,7 @@ class BaseContext:
     def RawValue(self, typecode_or_type: str, *args: Any) -> Any: ...
 
     def RawValue(self, typecode_or_type: Any, *args: Any) -> Any:
-        """A ctypes object in shared memory."""
+        """Return a ctypes object in shared memory."""
         from fiber.sharedctypes import RawValue
 
         config.use()
@@ -276,7 +276,7 @@ class BaseContext:
     def RawArray(self, typecode_or_type: str, size_or_initializer: Size) -> Any: ...
 
     def RawArray(self, typecode_or_type: Any, size_or_initializer: Size) -> Any:
-        """A ctypes array in shared memory."""
+        """Return a ctypes array in shared memory."""
         from fiber.sharedctypes import RawArray
 
         config.use()
@@ -285,7 +285,7 @@ class BaseContext:
     # Managers
 
     def Manager(self) -> SyncManager:
-        """A manager that is started, with all that multiprocessing's serves."""
+        """Return a started manager that serves all types of multiprocessing's."""
         from fiber.managers import SyncManager
 
         manager = SyncManager(ctx=self.get_context())
@@ -311,7 +311,7 @@ class BaseContext:
         idle_timeout: float | None = 60.0,
         pool: str | None = None,
     ) -> Pool:
-        """A pool of workers; ``fiber.pool.Pool`` says what the options mean."""
+        """Return a pool of workers; ``fiber.pool.Pool`` documents the options."""
         start_methods.start_zygote()
         from fiber.pool import Pool
 
@@ -350,8 +350,10 @@ class BaseContext:
     def get_context(self, method: str | None) -> BaseContext: ...
 
     def get_context(self, method: str | None = None) -> BaseContext:
-        """The context of a start method; if none is named this one, or for ``fiber`` itself the one
-        in force.
+        """Return the context of a start method.
+
+        Without ``method`` return this context.  ``fiber`` itself returns that of the method in
+        force.
         """
         if method is None:
             return self._in_force()
@@ -369,26 +371,29 @@ class BaseContext:
     def get_start_method(self, allow_none: bool) -> str | None: ...
 
     def get_start_method(self, allow_none: bool = False) -> str | None:
-        """The name of the start method; with ``allow_none`` None if nothing was set or used."""
+        """Return the start method; with ``allow_none`` None if none was set or used."""
         return self._start_method(allow_none)
 
     def _start_method(self, allow_none: bool) -> str | None:
         return self._method
 
     def set_start_method(self, method: str | None, force: bool = False) -> None:
-        """Only the default context's can be set."""
+        """Refuse: only the default context's start method can be set."""
         raise ValueError("cannot set start method of concrete context")
 
     def get_all_start_methods(self) -> list[str]:
-        """The start methods, the default first."""
+        """Return the names of the start methods, the default first."""
         return list(start_methods.START_METHODS)
 
     def set_executable(self, executable: str | bytes | os.PathLike[str]) -> None:
-        """The interpreter for processes started with ``spawn`` on this host."""
+        """Set the interpreter for processes started with ``spawn`` on this host."""
         spawn.set_executable(os.fsdecode(executable))
 
     def set_forkserver_preload(self, module_names: list[str]) -> None:
-        """Modules that the zygote imports before it forks; takes effect before the first start."""
+        """Set the modules that the zygote imports before it forks.
+
+        Call it before the first start: later calls have no effect.
+        """
         if not all(isinstance(name, str) for name in module_names):
             raise TypeError("module_names must be a list of strings")
         start_methods.preload[:] = module_names
@@ -400,7 +405,7 @@ class BaseContext:
         """Do nothing: connections always pickle."""
 
     def get_logger(self) -> logging.Logger:
-        """multiprocessing's logger, which Fiber shares."""
+        """Return multiprocessing's logger, which Fiber shares."""
         return util.get_logger()
 
     def log_to_stderr(self, level: int | str | None = None) -> logging.Logger:

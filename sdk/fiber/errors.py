@@ -1,4 +1,4 @@
-"""The errors that Fiber raises, next to the ones that it shares with multiprocessing.
+"""Errors that Fiber raises, and those that it shares with multiprocessing.
 
     Exception
     ├── ProcessError              multiprocessing's own class, as are the next three
@@ -11,20 +11,20 @@
     │       ├── ConfigError       a key or value that is wrong (also ValueError)
     │       ├── ConnectionClosed  the other end of a link is gone (also EOFError)
     │       ├── FiberPoolError    a FiberPool on Kubernetes that cannot serve
-    │       ├── FileTooLarge      a message, or shared memory, above the limit (also OSError)
-    │       ├── LinkError         no way between program and agent, a port in use for instance
+    │       ├── FileTooLarge      shared memory above the limit of file sizes (also OSError)
+    │       ├── LinkError         no link between program and agent, a port in use for instance
     │       ├── MemberLost        a process of a ring that has ended
-    │       ├── ProgramTooLarge   the program's folder is more than is sent to other machines
+    │       ├── ProgramTooLarge   the program's folder is too large to be sent to other hosts
     │       ├── StartError        a process that does not start, an initializer that fails
     │       ├── TooManyOpenFiles  the limit of file descriptors is reached (also OSError)
     │       ├── UnpicklableError  an object that cannot travel (also PicklingError, TypeError)
-    │       ├── VersionMismatch   two sides that do not speak the same version
-    │       └── WorkerDied        a task whose worker died, every time it was tried
+    │       ├── VersionMismatch   two sides that differ in a version
+    │       └── WorkerDied        a task whose worker died at each try
     └── MaybeEncodingError        multiprocessing.pool's: a result that does not pickle
 
 Each message says what happened, why, and what to do. Errors cross processes: every class
-here pickles with all its attributes, and so do subclasses of FiberError, whatever the
-signature of their `__init__`.
+here pickles with all its attributes. Subclasses of FiberError do, too, with any signature of
+`__init__`.
 """
 
 from __future__ import annotations
@@ -76,11 +76,11 @@ if not TYPE_CHECKING:  # a type checker would accept any name
 
 
 class FiberError(ProcessError):
-    """Base of the errors that are Fiber's own."""
+    """Base of Fiber's errors."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # BaseException would call type(self)(*args), which fails for every __init__ that
-        # wants more than the message, and with it the pool that carries the error.
+        # BaseException would call type(self)(*args). That fails for an __init__ that takes more
+        # than the message, and then the pool that sends the error fails, too.
         return _rebuild, (type(self), self.args), self.__dict__ or None
 
 
@@ -92,15 +92,15 @@ def _rebuild(kind: type[FiberError], args: tuple[Any, ...]) -> FiberError:
 
 
 class ConfigError(FiberError, ValueError):
-    """A key that does not exist or a value that does not fit; names it and its source."""
+    """A key that does not exist or a value that does not fit; names the key and its source."""
 
 
 class AdoptionError(FiberError):
-    """`fiber.adopt()` cannot serve a module; names what stands in the way, nothing changed."""
+    """`fiber.adopt()` cannot rebind a module, and has left it unchanged; says why."""
 
 
 class AgentLost(FiberError):
-    """The agent of a host is out of reach, and with it the processes that it runs."""
+    """The agent of a host does not answer; the processes that it runs are lost."""
 
     def __init__(self, agent: str, host: str, reason: str) -> None:
         super().__init__(
@@ -115,8 +115,8 @@ class AgentLost(FiberError):
 class ConnectionClosed(EOFError, FiberError):
     """The other end of a link was closed, or its last holder died.
 
-    Differs from multiprocessing's EOFError, which it is too, by `peer` and `reason`: who
-    held the other end and how that process ended, where Fiber knows.
+    It is an EOFError, as in multiprocessing. In addition `peer` names the holder of the other
+    end, and `reason` says how its process ended, where Fiber knows.
     """
 
     def __init__(self, peer: str | None = None, reason: str | None = None) -> None:
@@ -131,10 +131,10 @@ class ConnectionClosed(EOFError, FiberError):
 
 
 class FiberPoolError(FiberError):
-    """A FiberPool that cannot be made, or that cannot give what was asked of it any more.
+    """A FiberPool that cannot be made, or whose pods cannot run.
 
-    `reason` is one word: that of the problem in the pool's status (`ImagePullError`), or
-    Kubernetes' own for a call that it refuses (`Forbidden`).
+    `reason` is one word: the problem in the pool's status (`ImagePullError`), or Kubernetes'
+    reason for a call that it refuses (`Forbidden`).
     """
 
     def __init__(self, message: str, *, pool: str, namespace: str, reason: str) -> None:
@@ -145,14 +145,14 @@ class FiberPoolError(FiberError):
 
 
 class FileTooLarge(FiberError, OSError):
-    """Shared memory would be larger than a file may be (errno EFBIG); says the limit."""
+    """Shared memory would exceed the limit of file sizes (errno EFBIG); says the limit."""
 
     def __init__(self, doing: str) -> None:
         soft, _ = resource.getrlimit(resource.RLIMIT_FSIZE)
         super().__init__(
             errno.EFBIG,
-            f"file too large while {doing}: large messages travel in shared memory, which is a "
-            f"file to the system, and this process may write files of {soft} bytes. Raise that "
+            f"file too large while {doing}: large messages travel in shared memory, which counts "
+            f"as a file, and this process may write files of {soft} bytes. Raise the limit "
             "with `ulimit -f` in the shell that starts the program, LimitFSIZE= in its systemd "
             "unit, or resource.setrlimit() in the program; or send less at a time",
         )
@@ -165,30 +165,30 @@ class LinkError(FiberError):
 
 
 class MemberLost(FiberError):
-    """A member of a ring has ended; `rank` is its own, `how` says how it ended."""
+    """A member of a ring has ended; `rank` is its number, `how` says how it ended."""
 
     def __init__(self, rank: int, how: str) -> None:
         super().__init__(
-            f"member {rank} of the ring is lost: {how}. Nothing comes of it any more, and what is "
-            "sent to it goes nowhere: run the ring again, from what was saved."
+            f"member {rank} of the ring is lost: {how}. It sends and receives no more messages. "
+            "Run the ring again, from saved state."
         )
         self.rank = rank
         self.how = how
 
 
 class ProgramTooLarge(FiberError):
-    """The program's files are more than Fiber sends to other machines.
+    """The program's files are too large to be sent to other hosts.
 
-    `folder` is the program's, `largest` what takes most: paths and their sizes, as text.
+    `folder` is the program's, `largest` are its largest parts: paths and sizes, as text.
     """
 
     def __init__(self, folder: str, size: str, limit: str, largest: Mapping[str, str]) -> None:
         lines = [f"{size:>12}  {in_one_line(path)}" for path, size in largest.items()]
         super().__init__(
-            f"the program in {folder!r} cannot be sent to its workers: it has {size}, and what is "
-            f"sent is at most {limit}.\n{block('What takes most:', lines)}\n"
-            f"Name what workers do not need in {folder}/.fiberignore, one line each, as in "
-            ".gitignore, or move it out of the folder; data that they do need belongs in their "
+            f"the program in {folder!r} cannot be sent to its workers: it has {size}, and at most "
+            f"{limit} are sent.\n{block('Its largest parts:', lines)}\n"
+            f"Name files that workers do not need in {folder}/.fiberignore, one line each, as in "
+            ".gitignore, or move them out of the folder. Put data that workers need into their "
             "image or on a volume."
         )
         self.folder = folder
@@ -198,15 +198,15 @@ class ProgramTooLarge(FiberError):
 class StartError(FiberError):
     """A process cannot start, or its initializer fails.
 
-    `cause` is the text of what went wrong in that process, a traceback for instance: the
-    exception itself may be of a class that this process cannot even import.
+    `cause` is the output or traceback of that process, as text: this process may be unable to
+    import the class of the exception.
     """
 
     def __init__(self, who: str, reason: str, cause: str = "", attempts: int = 1) -> None:
         tries = f" after {attempts} attempts" if attempts > 1 else ""
         message = f"{who} did not start{tries}: {reason}"
         if cause:
-            message += f"\n{block('What it said:', cause.splitlines())}"
+            message += f"\n{block('Its output:', cause.splitlines())}"
         super().__init__(message)
         self.who = who
         self.reason = reason
@@ -234,15 +234,15 @@ class TooManyOpenFiles(FiberError, OSError):
 class UnpicklableError(FiberError, pickle.PicklingError, TypeError):
     """An object cannot be sent to another process.
 
-    `what` is its role ("argument 2 of task f"), `path` the way from there to the culprit
-    ("['options'].lock", empty when unknown), `reason` the pickler's own words.
+    `what` is its role ("argument 2 of task f"), `path` the path from there to the culprit
+    ("['options'].lock", empty when unknown), `reason` the pickler's text.
     """
 
     def __init__(self, what: str, reason: str, path: str = "") -> None:
         at = f" (at {path})" if path else ""
         super().__init__(
             f"{what} cannot be pickled{at}: {reason}. Objects travel to other processes as "
-            "pickles: pass what it is made from and build it there, or give its class a "
+            "pickles. Pass the data that it is made from and build it there, or give its class a "
             "__reduce__ method."
         )
         self.what = what
@@ -271,13 +271,13 @@ class VersionMismatch(FiberError):
 class WorkerDied(FiberError):
     """The worker died while it ran a task, and no attempt is left.
 
-    The attributes are the last attempt's: `task` and `worker` are names, `exitcode` follows
-    multiprocessing (negative: the signal; None: unknown), `log` holds the last lines that
-    the worker wrote, `stack` the Python stacks of its threads if native code crashed,
-    `attempts` counts the runs of the task in which its worker died, `disruptions` those that
-    the cluster ended: by a drain, an eviction, a preemption, a lost node. On Kubernetes `pod`
-    and `node` are the names of the worker's pod and of the pod's node, elsewhere None, and
-    `reason` begins with Kubernetes' word where the pod has ended ("OOMKilled: ...").
+    The attributes describe the last attempt. `task` and `worker` are names. `exitcode` follows
+    multiprocessing (negative: the signal; None: unknown). `log` holds the last lines that the
+    worker wrote, `stack` the Python stacks of its threads if native code crashed. `attempts`
+    counts the runs of the task in which its worker died, `disruptions` those that the cluster
+    ended: by a drain, an eviction, a preemption, a lost node. On Kubernetes `pod` and `node`
+    name the worker's pod and its node; elsewhere they are None. If the pod has ended, `reason`
+    begins with Kubernetes' word for it ("OOMKilled: ...").
     """
 
     def __init__(
@@ -344,23 +344,24 @@ _CRASHES = frozenset({signal.SIGSEGV, signal.SIGBUS, signal.SIGILL, signal.SIGFP
 
 
 _ADVICE_BY_WORD = {
-    "Deleted": "find out who deletes the pods; if that is as it is, let tasks be shorter, or allow "
-    "more disruptions (disruptions=).",
-    "Drained": "what ended its host gave it no more time. Let tasks be shorter, or allow more "
+    "Deleted": "find out who deletes the pods. If you cannot prevent it, make tasks shorter, or "
+    "allow more disruptions (disruptions=).",
+    "Drained": "its host ended before the task did. Make tasks shorter, or allow more "
     "disruptions (disruptions=); on Kubernetes a pod may have a longer "
     "terminationGracePeriodSeconds.",
-    "Evicted": "its node ran short of what the pod used beyond its share, or is drained. Ask for "
-    "what a task needs with @fiber.meta(memory=, cpu=), or allow more disruptions (disruptions=).",
+    "Evicted": "the pod used more than it requested and its node ran short, or the node is "
+    "drained. Request what a task needs with @fiber.meta(memory=, cpu=), or allow more "
+    "disruptions (disruptions=).",
     "NodeLost": "look at the node; if nodes come and go, allow more disruptions (disruptions=).",
-    "OOMKilled": "give each process more memory than that with @fiber.meta(memory=), or let a task "
-    "hold less.",
-    "Preempted": "pods of a higher priority took its place. Give these a priorityClassName in the "
-    "template of fiber.init(), let tasks be shorter, or allow more disruptions "
+    "OOMKilled": "request more memory for each process with @fiber.meta(memory=), or make tasks "
+    "that use less.",
+    "Preempted": "pods of a higher priority took its place. Give workers a priorityClassName in "
+    "the template of fiber.init(), make tasks shorter, or allow more disruptions "
     "(disruptions=).",
-    "WrongAnswer": "only Fiber itself writes to the channel of a worker. Look for code in the task "
-    "or its libraries that does so, or that writes to descriptors which are not its own.",
+    "WrongAnswer": "only Fiber may write to the channel of a worker. Look for code in the task or "
+    "its libraries that writes to file descriptors which it did not open.",
 }
-"""Advice by the first word of the reason: Kubernetes' for the end of a pod, or Fiber's."""
+"""Advice by the first word of the reason, which is Kubernetes' or Fiber's."""
 
 
 def _advice(exitcode: int | None, reason: str, stack: str) -> str:
@@ -371,33 +372,33 @@ def _advice(exitcode: int | None, reason: str, stack: str) -> str:
         return "look at the host and its agent; how the worker itself ended is not known."
     if exitcode == -signal.SIGKILL:
         return (
-            "a SIGKILL that nobody sent is mostly the kernel, out of memory (`dmesg` tells). "
-            "Use fewer workers or smaller tasks, or ask for more with @fiber.meta(memory=)."
+            "a SIGKILL mostly comes from the kernel, out of memory (see `dmesg`). "
+            "Use fewer workers or smaller tasks, or request more with @fiber.meta(memory=)."
         )
     if -exitcode in _CRASHES:
         crashed = "native code crashed: an extension module or a library under it. "
         if stack:
-            return f"{crashed}The first line below that is not Python's own says who called it."
+            return f"{crashed}The first line below that is not in Python's library called it."
         return f"{crashed}Run with PYTHONFAULTHANDLER=1 to see the Python line that called it."
     if exitcode < 0:
         return "find out who sends this signal to the program's processes."
     ended_itself = (
-        "the task ended its process itself: by os._exit(), or by native code. "
+        "the task ended its process: by os._exit(), or by native code. "
         "Let it return, or raise an exception, instead."
     )
-    if exitcode == 1:  # also Python's own, of what nobody caught before the task began
+    if exitcode == 1:  # also Python's, for an exception before the first task
         return (
-            "if its last output tells of an error, mend that; a module that is missing in a pod "
+            "if its last output shows an error, correct that; a module that is missing in a pod "
             f"belongs in its image. Otherwise {ended_itself}"
         )
     return ended_itself
 
 
 def in_one_line(path: str) -> str:
-    """Return a path for people: quoted if it has line breaks or bytes that are no text."""
+    """Return a path for messages: quoted if it has line breaks or bytes that are no text."""
     return path if path.isprintable() else repr(path)
 
 
 def block(title: str, lines: Sequence[str]) -> str:
-    """Return lines from somewhere else as a part of a message."""
+    """Return quoted lines as a part of a message."""
     return "\n".join([title, *(f"  | {line}" for line in lines)])

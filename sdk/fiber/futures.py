@@ -1,7 +1,7 @@
-"""``Executor``: concurrent.futures', whose worker processes are Fiber's.
+"""``Executor``: concurrent.futures' executor of processes, run by Fiber.
 
 ``from fiber import futures`` instead of ``from concurrent import futures``: signatures, states of
-futures and errors are concurrent.futures'.  What is more is spelled by keywords and ``options``.
+futures and errors are concurrent.futures'.  Additions are keywords, and the method ``options``.
 """
 
 from __future__ import annotations
@@ -72,30 +72,31 @@ _T = TypeVar("_T")
 
 
 class WorkerDied(errors.WorkerDied, BrokenProcessPool):
-    """``fiber.WorkerDied``, and what concurrent.futures raises then.
+    """``fiber.WorkerDied`` as executors raise it: it is a BrokenProcessPool, too.
 
-    It concerns this task alone: the executor goes on with another worker.
+    It concerns this task alone.  The executor goes on with another worker.
     """
 
 
 class Executor(concurrent.futures.Executor):
     """A ``concurrent.futures.ProcessPoolExecutor`` that a worker's death does not break.
 
-    At most ``max_workers`` processes (by default ``cpu_count()``) start as there is work for them.
-    Each begins with ``initializer(*initargs)`` and is replaced after ``max_tasks_per_child`` tasks
-    (None: never).  ``mp_context`` is that of the start method.  Beyond concurrent.futures:
+    At most ``max_workers`` processes (by default ``cpu_count()``) start as tasks need them.  Each
+    calls ``initializer(*initargs)`` first and is replaced after ``max_tasks_per_child`` tasks
+    (None: never).  ``mp_context`` chooses the start method.  Beyond concurrent.futures:
 
     * A task whose worker dies runs again elsewhere, at most ``retries`` times (None: as
-      configured), then it raises ``WorkerDied``, which is a BrokenProcessPool; other tasks never
-      notice.  The executor is broken only when no worker starts.  A worker that the cluster ends
-      (drained, evicted, preempted, its node lost) uses up no retry: its task runs again at most
-      ``disruptions`` times (None: as configured, and with ``retries=0`` never).
-    * A task that raises one of ``retry_exceptions`` runs again, too, before the exception counts.
-    * A worker that has had nothing to do for ``idle_timeout`` seconds (None: for ever) leaves.
-    * On Kubernetes workers have what ``fiber.meta`` or ``options`` says that their tasks need;
-      ``pool`` is the name of a FiberPool that is there already, whose pods are used.
+      configured).  Then it raises ``WorkerDied``, which is a BrokenProcessPool.  Other tasks are
+      not affected.  The executor is broken only when no worker starts.  If the cluster ends a
+      worker (drained, evicted, preempted, its node lost), its task uses up no retry.  It runs again
+      at most ``disruptions`` times (None: as configured; with ``retries=0`` never).
+    * A task that raises one of ``retry_exceptions`` also runs again, up to ``retries`` times,
+      before the exception counts.
+    * A worker ends after ``idle_timeout`` idle seconds (None: never).
+    * On Kubernetes workers have the resources that ``fiber.meta`` or ``options`` wishes for their
+      tasks.  ``pool`` names an existing FiberPool, whose pods are used.
 
-    Left by Ctrl-C, a ``with`` block waits for the tasks that run and cancels those that do not.
+    When Ctrl-C ends a ``with`` block, it waits for the running tasks and cancels the others.
     """
 
     def __init__(
@@ -156,11 +157,11 @@ class Executor(concurrent.futures.Executor):
     ) -> Executor:
         """Return this executor with options for the tasks that are submitted through the result.
 
-        ``executor.options(memory="8Gi", retries=0).submit(f)``, as Ray spells it.  The options
-        from ``cpu`` to ``tolerations`` are wishes as in ``fiber.meta``; tasks with different wishes
+        ``executor.options(memory="8Gi", retries=0).submit(f)``, as in Ray.  The options from
+        ``cpu`` to ``tolerations`` are wishes as in ``fiber.meta``.  Tasks with different wishes
         have different workers, ``max_workers`` of each kind.  A task that runs for longer than
-        ``timeout`` seconds raises ``fiber.TimeoutError``, and its worker is replaced.  What is left
-        out is as it was.  To shut down either is to shut down both.
+        ``timeout`` seconds raises ``fiber.TimeoutError``, and its worker is replaced.  Options that
+        are left out keep their values.  ``shutdown`` of one executor shuts down both.
         """
         other = object.__new__(type(self))
         vars(other).update(vars(self))
@@ -184,10 +185,10 @@ class Executor(concurrent.futures.Executor):
         return other
 
     def submit(self, fn: Callable[_P, _T], /, *args: _P.args, **kwargs: _P.kwargs) -> Future[_T]:
-        """Have ``fn(*args, **kwargs)`` called in a worker; returns the future of its result.
+        """Call ``fn(*args, **kwargs)`` in a worker; return the future of its result.
 
-        It is concurrent.futures', and coroutines of asyncio can await it.
-        The arguments are pickled at once: what happens to them later changes nothing.
+        It is a future of concurrent.futures, and coroutines of asyncio can await it.  The arguments
+        are pickled at once, so the caller may change them afterwards.
         """
         engine = self._group.executor_for(fn, self._wishes)
         queue = self._queues.get(engine) or self._queue(engine)
@@ -203,12 +204,12 @@ class Executor(concurrent.futures.Executor):
         chunksize: int = 1,
         buffersize: int | None = None,
     ) -> Iterator[_T]:
-        """An iterator over ``fn(*items) for items in zip(*iterables)``, in order.
+        """Return an iterator over ``fn(*items) for items in zip(*iterables)``, in order.
 
-        It raises TimeoutError if a result is not there ``timeout`` seconds after this call, and
-        ends with the first error; what has not begun by then is cancelled.  ``chunksize``: so many
-        items go to one worker together.  Iterators are read in another thread, little faster than
-        they are worked off; with ``buffersize`` also at most so many items ahead of what was taken.
+        It raises TimeoutError if a result is not there ``timeout`` seconds after this call.  It
+        ends with the first error, and cancels the tasks that have not begun.  ``chunksize`` items
+        go to one worker together.  Another thread reads iterators, a little faster than their tasks
+        run.  With ``buffersize`` it reads at most so many items ahead of the results taken.
         """
         deadline = None if timeout is None else time.monotonic() + timeout
         ahead = options.buffersize(buffersize)
@@ -234,14 +235,14 @@ class Executor(concurrent.futures.Executor):
         return _taken(results, engine, item, deadline)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Take no more tasks; the workers leave once those that are there are done.
+        """Take no more tasks.  The workers end once the present tasks are done.
 
-        ``wait``: return only then.  ``cancel_futures``: cancel those that have not begun.
+        ``wait``: return only then.  ``cancel_futures``: cancel the tasks that have not begun.
         """
         self._group.shut_down(wait, cancel_futures)
 
     def terminate_workers(self) -> None:
-        """End the workers at once and for good; what is not done raises BrokenProcessPool."""
+        """End the workers at once and for good; unfinished tasks raise BrokenProcessPool."""
         self._group.terminate()
 
     def __exit__(
@@ -257,9 +258,9 @@ class Executor(concurrent.futures.Executor):
 
     def _queue(self, engine: PoolExecutor) -> CallQueue:
         queue = CallQueue(limits=self._limits, timeout=self._timeout, cancellable=True)
-        return self._queues.setdefault(engine, queue)  # another thread may be here as well
+        return self._queues.setdefault(engine, queue)  # another thread may call this, too
 
-    # What libraries look at
+    # Attributes of concurrent.futures that libraries use
 
     @property
     def _processes(self) -> dict[int | None, BaseProcess]:
@@ -275,9 +276,9 @@ ProcessPoolExecutor = Executor
 
 
 class CallFuture(Future[_T]):
-    """The future of one call, as an executor sees it: ``work_items.Cancellable``.
+    """Future of one call, which an executor uses as a ``work_items.Cancellable``.
 
-    What runs the user's code, unpicklers and callbacks, does not run on the loop's thread.
+    The user's code, unpicklers and callbacks, does not run on the loop thread.
     """
 
     def __init__(self, executor: PoolExecutor, queue: CallQueue) -> None:
@@ -285,13 +286,13 @@ class CallFuture(Future[_T]):
         self._executor = executor
         self._threads = executor.threads
         self._queue = queue
-        self._undecided = bytearray(1)  # which the collector has no work with
+        self._undecided = bytearray(1)  # a type that the garbage collector does not visit
         """Token of a decision.  The side that takes it out runs the call, or cancels it."""
         self._claimed: bool | None = None
 
     def __await__(self) -> Generator[Any, None, _T]:
         """Await the result.  A task that is cancelled meanwhile cancels the call."""
-        import asyncio  # who awaits has it already, and it takes long to import
+        import asyncio  # takes long to import; a caller that awaits has imported it
 
         return asyncio.wrap_future(self).__await__()
 
@@ -335,7 +336,7 @@ class CallFuture(Future[_T]):
             return False
         return True
 
-    # What the executor says, on the loop's thread
+    # Reports of the executor, on the loop thread
 
     def claim(self) -> bool:
         """Claim the call for a worker; return False if it was cancelled."""
@@ -348,7 +349,7 @@ class CallFuture(Future[_T]):
         return self._claimed
 
     def _end_cancelled(self) -> None:
-        super().cancel()  # whoever did may have been interrupted
+        super().cancel()  # the caller of ``cancel`` may have been interrupted
         self.set_running_or_notify_cancel()
 
     def add_results(self, start: int, outcomes: list[Any], mixed: bool, size: int = 0) -> bool:
@@ -385,15 +386,15 @@ class CallFuture(Future[_T]):
     def _unpickle(self, outcome: Pickled) -> None:
         try:
             value = outcome.decode()
-        except BaseException as error:  # whatever the user's unpickler raises
+        except BaseException as error:  # the user's unpickler may raise anything
             value = TaskFailure(error)
         self._settle(value)
 
     def _locked(self, action: Callable[[], object]) -> None:
-        """Do what takes the lock that the program's threads take, too.
+        """Run an action that takes the future's lock, which the program's threads take, too.
 
-        The loop does not wait for it: one who was interrupted between taking it and the ``with``
-        block has it for as long as it likes.
+        The loop does not wait for the lock: a thread that was interrupted just after taking it may
+        keep it for any time.
         """
         if not self._executor.on_loop():
             action()
@@ -419,12 +420,12 @@ class CallFuture(Future[_T]):
                 return
         try:
             action()  # else the outcome, or its callbacks, would be lost
-        except BaseException:  # of a callback that exits: the loop has to go on
+        except BaseException:  # also SystemExit from a callback: the loop must go on
             report_uncaught()
 
 
 def translated(error: BaseException, executor: PoolExecutor) -> BaseException:
-    """An error of the executor's as concurrent.futures' users know it."""
+    """Return an executor's error in the class that concurrent.futures would raise."""
     if error is executor.error:
         return broken(error)
     if type(error) is errors.WorkerDied:
@@ -449,16 +450,16 @@ def _process(context: Any) -> Any:
 
 
 def _iterable(given: Any) -> Iterable[Any]:
-    """Return what is taken whole as it is, and the iterator of all else, or raise TypeError."""
+    """Return sequences that are taken whole unchanged; return an iterator of anything else."""
     return given if isinstance(given, (*SLICEABLE, list)) else iter(given)
 
 
 def _taken(
     results: IMapIterator[Any], engine: PoolExecutor, item: WorkItem | None, deadline: float | None
 ) -> Iterator[Any]:
-    """The results of a map, up to the first error."""
+    """Yield the results of a map, up to the first error."""
     try:
-        # In a list, so that nothing here keeps a result that the user has let go of.
+        # In a list, so that this frame keeps no result that the user has dropped.
         while held := _next(results, engine, deadline):
             yield held.pop()
     finally:
@@ -467,7 +468,7 @@ def _taken(
 
 
 def _next(results: IMapIterator[Any], engine: PoolExecutor, deadline: float | None) -> list[Any]:
-    """The next result of a map; none at its end."""
+    """Return the next result of a map in a list, which is empty at the end."""
     left = None if deadline is None else deadline - time.monotonic()
     try:
         outcome = results._take(left)

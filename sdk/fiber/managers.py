@@ -1,10 +1,10 @@
-"""Managers: multiprocessing's, whose server is a Fiber process and can be reached from any other.
+"""Managers as in multiprocessing; their server is a Fiber process that any process can reach.
 
 The proxies, ``RemoteError``, ``Token`` and ``Namespace`` are multiprocessing's classes.
 
-Differs from multiprocessing in what becomes of a process that is killed: the objects that only it
-referred to go, the locks that it held are released, and whoever acquires one of these next gets a
-RuntimeWarning that names it.
+Differs from multiprocessing when a process is killed.  Objects to which only it referred are
+dropped, and the locks that it held are released.  The next holder of such a lock gets a
+RuntimeWarning that names the process.
 """
 
 from __future__ import annotations
@@ -90,19 +90,19 @@ def _make_server(registry: Any, address: Any, authkey: bytes, serializer: str) -
 
 
 class BaseManager(mp_managers.BaseManager):
-    """multiprocessing's, whose server runs in a Fiber process: on a cluster, in a pod.
+    """multiprocessing's manager, with its server in a Fiber process: on a cluster, in a pod.
 
-    Without an ``address`` any process of the program can use the manager and its proxies, and
-    nobody else: ``address`` can be sent to one that should ``connect``.  With an address it is
-    multiprocessing's listener there, and other programs can ``connect`` with the same ``authkey``.
+    Without an ``address`` only processes of this program can use the manager and its proxies.  Send
+    them ``address``, and they can ``connect``.  With an address the server has multiprocessing's
+    listener there, and other programs can ``connect`` with the same ``authkey``.
 
-    What the process wishes of its host is what ``fiber.meta`` gave the class, and besides the most
-    of what it gave the registered callables.  ``pool`` is the FiberPool whose pods are meant.
+    The server's process has the resources that ``fiber.meta`` wishes for the class, and at least
+    the largest that it wishes for a registered callable.  ``pool`` names the FiberPool to use.
     """
 
     _Server = staticmethod(_make_server)
 
-    if TYPE_CHECKING:  # multiprocessing's, of which typeshed does not tell
+    if TYPE_CHECKING:  # attributes of multiprocessing's class that typeshed lacks
         _registry: dict[str, tuple[Callable[..., Any] | None, Any, Any, Any]]
         _state: Any
         _authkey: bytes
@@ -145,8 +145,8 @@ class BaseManager(mp_managers.BaseManager):
     ) -> None:
         """Start the server's process.
 
-        EOFError if its ``initializer`` raises.  On Kubernetes it does not wait for a pod that is
-        yet to be made: whoever uses the manager first does.
+        EOFError if its ``initializer`` raises.  On Kubernetes this does not wait for a pod.  The
+        first use of the manager waits.
         """
         self._check_initial()
         if initializer is not None and not callable(initializer):
@@ -204,9 +204,9 @@ class BaseManager(mp_managers.BaseManager):
                 self._session.process = weakref.ref(process)
 
     def connect(self) -> None:
-        """Use a server that runs already, at the address that was given."""
+        """Use the running server at the manager's address."""
         if self._known_address is None:
-            raise ValueError("a manager that is to connect needs the address of a running one")
+            raise ValueError("connect() needs the address of a running manager: pass address=")
         super().connect()
         self._hold_session()
 
@@ -217,7 +217,7 @@ class BaseManager(mp_managers.BaseManager):
         return token, exposed
 
     def get_server(self) -> mp_managers.Server:
-        """The server, to be run in this process: it has ``serve_forever`` and ``address``."""
+        """Return a server for this process, with ``serve_forever`` and ``address``."""
         self._check_initial()
         server: mp_managers.Server = self._Server(
             self._registry, self._address, self._authkey, self._serializer
@@ -234,7 +234,7 @@ class BaseManager(mp_managers.BaseManager):
     @staticmethod
     def _end(process: Process, known: list[Any], *rest: Any) -> None:
         """End the server: in ``shutdown``, at the program's end, or from the garbage collector."""
-        if runtime().loop.on_thread():  # collected there: the loop must not wait for itself
+        if runtime().loop.on_thread():  # the loop must not wait for itself
             threading.Thread(target=BaseManager._end, args=(process, known, *rest)).start()
             return
         address = known[0] if known else None
@@ -246,20 +246,20 @@ class BaseManager(mp_managers.BaseManager):
 
 
 class SharedMemoryManager(BaseManager):
-    """Makes named shared memory, which goes when the manager is shut down.
+    """Manager of named shared memory, which it removes when it is shut down.
 
-    On one host: RuntimeError if the manager's process is on another one than who asks it.
+    Its methods raise RuntimeError in a process that is not on the host of the manager's server.
     """
 
     def SharedMemory(self, size: int) -> SharedMemory:
-        """A new block of ``size`` bytes; ValueError if the manager does not run."""
+        """Return a new block of ``size`` bytes; ValueError if the manager does not run."""
         names = self._names()
         memory = SharedMemory(create=True, size=size)
         names.append(memory.name)
         return memory
 
     def ShareableList(self, sequence: Iterable[_T] | None) -> ShareableList[_T]:
-        """A new list; ValueError if the manager does not run."""
+        """Return a new list; ValueError if the manager does not run."""
         names = self._names()
         made: ShareableList[_T] = ShareableList(sequence)
         names.append(made.shm.name)
@@ -274,7 +274,7 @@ class SharedMemoryManager(BaseManager):
             raise RuntimeError(
                 f"the manager runs on host {host!r} and this process on {hub_client.host()!r}: "
                 "named shared memory is for the processes of one host. Use fiber.Array or "
-                "fiber.RawArray, whose memory goes when nobody uses it"
+                "fiber.RawArray, whose memory is freed with its last user"
             )
         return names
 
@@ -315,7 +315,7 @@ SharedMemoryManager.register("_memory_names", _memory_names, exposed=("append", 
 
 
 class SyncManager(BaseManager, mp_managers.SyncManager):
-    """A manager of lists, dicts, queues, locks and all else that multiprocessing registers."""
+    """A manager of lists, dicts, queues, locks and all other types that multiprocessing has."""
 
     if TYPE_CHECKING:
         Pool: ClassVar[type[_Pool]]  # type: ignore[assignment]  # it takes Fiber's options
@@ -328,11 +328,11 @@ def _pool(*args: Any, **options: Any) -> Any:
 
 
 class AsyncManager(BaseManager):
-    """A manager of whose objects every method returns an ``AsyncProxyResult`` at once.
+    """A manager whose objects' methods return an ``AsyncProxyResult`` at once.
 
-    Objects of different managers work side by side, those of one in threads of its process.  An
-    object is made before the manager's method for that returns.  It registers no types of its own,
-    and has no address that other programs could connect to.
+    Objects of different managers work in parallel.  Objects of one manager work in threads of its
+    process.  The manager's method that makes an object waits until the object exists.  The class
+    registers no types.  Other programs cannot connect to it.
     """
 
     def __init__(self, address: ManagerAddress | None = None, **options: Any) -> None:

@@ -1,7 +1,7 @@
-"""``Pool``: multiprocessing's, that cannot hang.
+"""``Pool``: multiprocessing's pool, in a form that cannot hang.
 
-Signatures, results and errors are multiprocessing's.  What is more is spelled by keywords, so that
-code which ignores it also runs there.
+Signatures, results and errors are multiprocessing's.  Additions are keywords, so code that does not
+use them also runs with multiprocessing.
 """
 
 from __future__ import annotations
@@ -66,24 +66,24 @@ _ErrorCallback = Callable[[BaseException], object]
 class Pool:
     """A pool of worker processes.
 
-    ``processes`` is their number, by default ``cpu_count()``.  Each begins with
-    ``initializer(*initargs)``, and is replaced after ``maxtasksperchild`` tasks (None: never).
-    ``context`` is that of the start method.  Beyond multiprocessing:
+    ``processes`` is their number, by default ``cpu_count()``.  Each calls
+    ``initializer(*initargs)`` first, and is replaced after ``maxtasksperchild`` tasks (None:
+    never).  ``context`` chooses the start method.  Beyond multiprocessing:
 
     * ``min_workers`` (by default 1) and ``max_workers`` (by default ``cpu_count()``), in place of
-      ``processes``, make the pool follow the work.  A worker above ``min_workers`` that has had
-      nothing to do for ``idle_timeout`` seconds (None: for ever) leaves.
+      ``processes``, make the pool follow the work.  A worker above ``min_workers`` ends after
+      ``idle_timeout`` idle seconds (None: never).
     * A task whose worker dies runs again elsewhere, at most ``retries`` times (None: as
-      configured), then it raises ``WorkerDied``; other tasks never notice.  A worker that the
-      cluster ends (drained, evicted, preempted, its node lost) uses up no retry: its task runs
-      again at most ``disruptions`` times (None: as configured, and with ``retries=0`` never).
+      configured).  Then it raises ``WorkerDied``.  Other tasks are not affected.  If the cluster
+      ends a worker (drained, evicted, preempted, its node lost), its task uses up no retry.  It
+      runs again at most ``disruptions`` times (None: as configured; with ``retries=0`` never).
     * A task that raises one of ``retry_exceptions`` (with ``error_handling=True`` any Exception)
-      runs again, too, before the exception counts.
+      also runs again, up to ``retries`` times, before the exception counts.
     * A task that runs for longer than ``task_timeout`` seconds, or the ``timeout=`` of its call,
       raises TimeoutError, and its worker is killed and replaced.
-    * On Kubernetes, ``pool`` is the name of a FiberPool that is there already, whose pods are used
-      in place of the program's own.  Workers start with the first task there, and have what
-      ``fiber.meta`` says that its function needs.
+    * On Kubernetes, ``pool`` names an existing FiberPool, whose pods are used in place of new ones.
+      There workers start with the first task, and have the resources that ``fiber.meta`` wishes
+      for its function.
     """
 
     _state = INIT  # until ``__init__`` is through; ``__del__`` looks at it
@@ -129,7 +129,7 @@ class Pool:
             ),
             runtime(),
         )
-        # First: whoever is interrupted while the workers start has forgotten the pool.
+        # Before the start: if that is interrupted, the caller has no pool to terminate.
         self._terminate = util.Finalize(self, _abandon, args=(self._executor,), exitpriority=15)
         self._executor.start()
         _logs.debug("opened a pool of %d to %d workers", minimum, maximum)
@@ -147,8 +147,8 @@ class Pool:
     ) -> _T:
         """Call ``func(*args, **kwds)`` in a worker and return its result.
 
-        TimeoutError, and the worker is killed, if it runs for longer than ``timeout`` seconds; None
-        stands for the pool's ``task_timeout``, infinity for no limit.
+        If the call runs for longer than ``timeout`` seconds, its worker is killed, and TimeoutError
+        is raised.  None stands for the pool's ``task_timeout``, infinity for no limit.
         """
         self._check_running(func)
         self._check_may_wait()
@@ -188,16 +188,17 @@ class Pool:
     # Workers
 
     def start_workers(self) -> None:
-        """Start the workers now, where the first task would: on a cluster, where they are then such
-        as a function without wishes needs.
+        """Start the workers now, on a cluster, where otherwise the first task would start them.
+
+        They then have the resources for a function without wishes.
         """
         self._check_running()
         self._executor.start_workers()
 
     def wait_until_workers_up(self, timeout: float | None = None) -> None:
-        """Wait until all workers (with ``min_workers``: so many) are ready for tasks.
+        """Wait until all workers, or ``min_workers`` of them, are ready for tasks.
 
-        TimeoutError after ``timeout`` seconds; what keeps them from starting is raised.
+        TimeoutError after ``timeout`` seconds.  If workers cannot start, the reason is raised.
         """
         self._check_running()
         if not self._executor.wait_until_up(options.seconds("timeout", timeout)):
@@ -208,7 +209,7 @@ class Pool:
             )
 
     def workers(self) -> list[WorkerInfo]:
-        """The workers that there are, or that are being started, the oldest first."""
+        """Return the workers that run or start, the oldest first."""
         self._check_owner()
         return self._executor.workers.describe()
 
@@ -224,9 +225,9 @@ class Pool:
     ) -> list[_T]:
         """``[func(x) for x in iterable]``, the calls spread over the workers.
 
-        ``chunksize`` consecutive items go to one worker together; left out, it adapts to how long
-        they take.  An iterator is read as fast as it is worked off.  ``timeout``, as in ``apply``,
-        is that of each single task.
+        ``chunksize`` consecutive items go to one worker together.  By default it adapts to the
+        duration of the tasks.  An iterator is read as fast as its tasks run.  ``timeout``, as in
+        ``apply``, is for each single task.
         """
         return self._map(work.MAP, func, iterable, chunksize, timeout)
 
@@ -253,7 +254,7 @@ class Pool:
     ) -> MapResult[_T]:
         """Call as ``map`` does, but return a result once ``iterable`` is read.
 
-        Its items are pickled later: change none of them, as an array in place, before the result is
+        Items are pickled later.  Do not change them (an array in place, say) before the result is
         there.
 
         ``callback`` gets the list of results, ``error_callback`` the first error, as in
@@ -287,10 +288,11 @@ class Pool:
         timeout: float | None = None,
         buffersize: int | None = None,
     ) -> IMapIterator[_T]:
-        """An iterator over ``func(x) for x in iterable``, in order; ``timeout`` as in ``map``.
+        """Return an iterator over the results of ``func(x) for x in iterable``, in order.
 
-        ``iterable`` is read in another thread, little faster than it is worked off; with
-        ``buffersize`` also at most so many items ahead of what the iterator has given out.
+        Another thread reads ``iterable``, a little faster than its tasks run.  With ``buffersize``
+        it reads at most so many items ahead of the results that were taken.  ``timeout`` as in
+        ``map``.
         """
         iterator: IMapIterator[_T] = IMapIterator(self)
         return self._imap(iterator, func, iterable, chunksize, timeout, buffersize)
@@ -308,7 +310,7 @@ class Pool:
         iterator: IMapIterator[_T] = IMapUnorderedIterator(self)
         return self._imap(iterator, func, iterable, chunksize, timeout, buffersize)
 
-    # How they are done
+    # How calls and maps are done
 
     def _map(
         self,
@@ -330,7 +332,7 @@ class Pool:
                     stream.read(iterable)
                     self._executor.finish(item)
                 result.wait()
-            except BaseException:  # Ctrl-C: whoever waits for it no longer does
+            except BaseException:  # Ctrl-C: no caller waits for the rest
                 self._executor.cancel(item)
                 raise
         return result.get()
@@ -372,7 +374,10 @@ class Pool:
         chunksize: int | None,
         timeout: float | None,
     ) -> WorkItem | None:
-        """A map to come; None if its function does not pickle, which the future will be told."""
+        """Return the work item of a map.
+
+        If the function does not pickle, fail the future and return None.
+        """
         self._check_running(func)
         unit = 1 if chunksize is None else options.chunksize(chunksize)
         limit = self._limit(timeout)
@@ -404,11 +409,11 @@ class Pool:
         self._executor.submit(item, tasks)
 
     def _limit(self, timeout: float | None) -> float | None:
-        """Seconds that a task may take; None: any."""
+        """Return the seconds that a task may take; None for no limit."""
         return self._task_timeout if timeout is None else options.seconds("timeout", timeout)
 
     def _call_back(self, action: Callable[[], None]) -> bool:
-        """Have a callback run; False if none runs any more, or the system has no thread for it."""
+        """Run a callback on its thread; False if callbacks are over, or there is no thread."""
         try:
             return self._executor.threads.callbacks.submit(action)
         except RuntimeError:
@@ -426,7 +431,7 @@ class Pool:
 
     @property
     def _pool(self) -> list[Any]:
-        """The processes of its workers."""
+        """Processes of the workers."""
         return list(self._executor.workers.processes())
 
     def _repopulate_pool(self) -> None:
@@ -442,12 +447,12 @@ class Pool:
     def _check_owner(self) -> None:
         if os.getpid() != self._owner:
             raise RuntimeError(
-                f"this pool belongs to process {self._owner}: a copy of it that came here by a "
-                "fork has no workers; make a pool in this process"
+                f"this pool belongs to process {self._owner}: its copy in a forked process has no "
+                "workers. Make a pool in this process"
             )
 
     def close(self) -> None:
-        """Take no more work.  The workers go once all that was asked for is done."""
+        """Take no more work.  The workers end once all present tasks are done."""
         self._check_owner()
         _logs.debug("closing pool")
         if self._state == RUN:
@@ -455,18 +460,18 @@ class Pool:
             self._executor.close()
 
     def terminate(self) -> None:
-        """End the workers at once.  Whoever waits for a result gets an error."""
+        """End the workers at once.  Callers that wait for a result get an error."""
         if os.getpid() != self._owner:
-            return  # a copy that came here by a fork: nothing of the pool is here to end
+            return  # a copy in a forked process has no workers
         _logs.debug("terminating pool")
         self._state = TERMINATE
         _end(self._executor)
-        self._terminate.cancel()  # last: whoever is interrupted before it leaves that to do
+        self._terminate.cancel()  # last: if this is interrupted, it still ends the pool
 
     def join(self) -> None:
-        """Wait until all workers are gone; after ``close`` or ``terminate``.
+        """Wait until all workers have ended.  Call ``close`` or ``terminate`` first.
 
-        Results that nobody has taken from ``imap(buffersize=)`` no longer hold up what is left.
+        From now on unread results of ``imap(buffersize=)`` do not hold up the remaining tasks.
         """
         self._check_owner()
         _logs.debug("joining pool")
@@ -506,15 +511,15 @@ def _end(executor: PoolExecutor) -> None:
 
 def _terminated() -> FiberError:
     return FiberError(
-        "the pool was terminated before this result was there: close() and join() it "
-        "to wait for what was asked"
+        "the pool was terminated before this result was there. To wait for all results, call "
+        "close() and join() instead"
     )
 
 
 def _abandon(executor: PoolExecutor) -> None:
-    """The program ends, or has forgotten the pool."""
+    """End a pool that was not terminated: the program ends, or has dropped the pool."""
     if util.is_exiting():
         _end(executor)
     else:
-        # The garbage collector runs anywhere: nothing may be waited for here.
+        # The garbage collector runs on any thread, so this must not wait.
         executor.terminate(_terminated())

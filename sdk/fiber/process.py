@@ -1,4 +1,4 @@
-"""``Process``: multiprocessing's, run by Fiber.
+"""``Process``: multiprocessing's class, run by Fiber.
 
 The class is multiprocessing's own BaseProcess underneath, so that ``current_process``,
 ``active_children``, names, authentication keys and daemon flags are shared with it.
@@ -37,15 +37,15 @@ __all__ = [
 _ended: deque[weakref.ref[BaseProcess]] = deque()
 """Processes that ended, to be dropped from ``_children`` at the next start.
 
-Fiber's own thread only appends: a process that is dropped may run the user's finalizers.
+The loop thread only appends: dropping a process may run the user's finalizers.
 """
 
 
 class Process(BaseProcess):
     """A process that Fiber starts: a subprocess on a laptop, a child in a pod on a cluster.
 
-    As ``multiprocessing.Process``, with one difference: a daemonic process may have children too,
-    which end with it.
+    As ``multiprocessing.Process``, with one difference: a daemonic process may have children, which
+    end with it.
     """
 
     _start_method: str | None = None
@@ -64,7 +64,7 @@ class Process(BaseProcess):
         return partial(_ended.append, weakref.ref(self))
 
     def start(self) -> None:
-        """Start it; returns when it has a pid, or waits for a pod that is yet to be made."""
+        """Start it; return once it has a pid, or waits for a pod."""
         from fiber._runtime.start_methods import check_main
 
         self._check_closed()  # type: ignore[attr-defined]
@@ -78,19 +78,19 @@ class Process(BaseProcess):
         try:
             self._popen = popen = self._Popen()
             self._sentinel = popen.sentinel
-            # The child has them now; here they would keep the target's arguments alive.
+            # The child has its arguments.  The parent must not keep them alive.
             del self._target, self._args, self._kwargs  # type: ignore[attr-defined]
             _mp._children.add(self)  # type: ignore[attr-defined]
         except BaseException:
             if popen is not None:
-                popen.kill()  # an interruption: its caller does not know of it
+                popen.kill()  # interrupted: the caller has no started process
             raise
-        if self._popen.returncode is not None:  # its end came first, and found nothing to drop
+        if self._popen.returncode is not None:  # it ended before it was added
             _mp._children.discard(self)  # type: ignore[attr-defined]
 
 
 def _drop_ended() -> None:
-    """Forget ended children.  multiprocessing's ``_cleanup`` asks every child instead."""
+    """Forget ended children.  multiprocessing's ``_cleanup`` polls every child instead."""
     while _ended:
         try:
             process = _ended.popleft()()
@@ -150,7 +150,7 @@ class PoolProcess(Process):
 
 
 def process_type(method: str) -> type[Process]:
-    """The class of processes of a start method."""
+    """Return the class of processes of a start method."""
     types: tuple[type[Process], ...] = (ForkProcess, ForkServerProcess, SpawnProcess)
     return {cls._start_method or "": cls for cls in types}[method]
 

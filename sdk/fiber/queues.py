@@ -5,13 +5,14 @@
     put ── pickle ── a slot ─┬─ room in the channel ─────────► channel ──► get ── the slot is free
                              └─ no room: feeder ────────────►
 
-There is no lock between processes: an item is one message, which the kernel gives to exactly one
-reader.  A process that dies while it waits takes nothing; one that dies later takes its own item.
+Processes share no lock.  An item is one message, which the kernel gives to exactly one reader.  If
+a process dies while it waits, no item is lost.  If it dies later, the item that it has taken is.
 
-Ctrl-C in ``put`` leaves the item either put or not, and its place taken or free as it should be;
-but for the moment in which the kernel takes the item: then it is there, and counts as not put.
+Ctrl-C in ``put`` leaves the item either put, with its slot taken, or not put, with its slot free.
+There is one exception: if it strikes while the kernel takes the item, the item is in the queue, and
+``put`` raises as if it were not.
 
-Differs from multiprocessing in that an item is pickled when it is put, not some time later.
+Differs from multiprocessing: ``put`` pickles the item at once, and not some time later.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ class Queue(Generic[_T]):
         util.register_after_fork(self, Queue._new_feeder)
 
     def _new_feeder(self) -> None:
-        # What the parent of a fork has not sent yet, the parent sends.
+        # After a fork, the parent sends the items that it has put.
         self._feeder = Feeder(
             self,
             self._outbox,
@@ -79,15 +80,15 @@ class Queue(Generic[_T]):
         )
 
     def put(self, obj: _T, block: bool = True, timeout: float | None = None) -> None:
-        """Put an item; Full if no slot is free, nor within ``timeout`` seconds.
+        """Put an item; Full if no slot becomes free within ``timeout`` seconds.
 
-        An item that does not pickle is given to ``_on_queue_feeder_error``.
+        An item that does not pickle is passed to ``_on_queue_feeder_error``.
         """
         if self._closed:
             raise ValueError(f"Queue {self!r} is closed")
         if not block and self._slots.full():
             raise Full
-        # Before it has a place: a process that dies while it pickles has taken none.
+        # Pickle before taking a slot: a process that dies meanwhile keeps no slot.
         message = _encode(obj)
         if isinstance(message, Exception):
             self._on_queue_feeder_error(message, obj)
@@ -110,7 +111,7 @@ class Queue(Generic[_T]):
         self._feeder.put(payload, buffers, taken)
 
     def get(self, block: bool = True, timeout: float | None = None) -> _T:
-        """The next item; Empty if there is none, nor within ``timeout`` seconds."""
+        """Return the next item; Empty if none comes within ``timeout`` seconds."""
         if self._closed:
             raise ValueError(f"Queue {self!r} is closed")
         if not block:
@@ -131,7 +132,7 @@ class Queue(Generic[_T]):
         self.put(obj, False)
 
     def get_nowait(self) -> _T:
-        """The next item; Empty if there is none."""
+        """Return the next item; Empty if there is none."""
         return self.get(False)
 
     def qsize(self) -> int:
@@ -150,18 +151,18 @@ class Queue(Generic[_T]):
         return self._slots.full()
 
     def close(self) -> None:
-        """Put and get no more in this process.  Items that it has put are still sent."""
+        """Close the queue for this process.  Items that it has put are still sent."""
         self._closed = True
         self._reader.close()
         self._feeder.close()
 
     def join_thread(self) -> None:
-        """After ``close``: wait until everything that this process put is sent."""
+        """Wait until all items that this process put are sent.  Call ``close`` first."""
         assert self._closed, f"Queue {self!r} not closed"
         self._feeder.join()
 
     def cancel_join_thread(self) -> None:
-        """Let this process end even if not all that it put is sent."""
+        """Let this process end even if some of its items are not sent."""
         self._feeder.cancel_join()
 
     @staticmethod
@@ -176,7 +177,7 @@ class Queue(Generic[_T]):
 
 
 def _encode(obj: Any) -> tuple[bytes, list[memoryview], Callable[[], None]] | Exception:
-    """An item, pickled, and how to take that back; or why it does not pickle."""
+    """Pickle an item; return it with a function that revokes its grants, or return the error."""
     try:
         return reduction.encode_revocable(obj)
     except Exception as error:
@@ -189,7 +190,7 @@ class JoinableQueue(Queue[_T]):
     def __init__(self, maxsize: int = 0, *, ctx: Any = None) -> None:
         super().__init__(maxsize, ctx=ctx)
         self._unfinished: SharedCounter = LocalCounter.create()
-        # Counts how often the count of unfinished items came down to zero.
+        # Number of times that the count of unfinished items has become zero.
         self._bell: SharedCounter = LocalCounter.create()
 
     def __getstate__(self) -> tuple[Any, ...]:
@@ -236,7 +237,7 @@ class SimpleQueue(Generic[_T]):
         self._writer.send(obj)
 
     def get(self) -> _T:
-        """The next item."""
+        """Return the next item; wait until there is one."""
         item: _T = self._reader.recv()
         return item
 
@@ -249,7 +250,7 @@ class SimpleQueue(Generic[_T]):
         return self._reader.poll(timeout)
 
     def close(self) -> None:
-        """Put and get no more in this process."""
+        """Close the queue for this process."""
         self._reader.close()
         self._writer.close()
 
@@ -264,14 +265,14 @@ class SimpleQueue(Generic[_T]):
 
 
 class SimpleQueuePush(Generic[_T]):
-    """A queue that deals its items round robin: each to the next reader in turn, before it asks.
+    """A queue that sends its items to the readers in turn, before they ask for them.
 
-    A process is a reader from its first ``get`` on, until it closes the queue or ends; an item for
-    which a reader has no room goes to the next one.  It suits items that take equally long.  What
-    was dealt to a reader that ends is lost with it, so where that must not be, or where items
-    differ, use ``SimpleQueue``, of which each reader takes an item when it has time for one.
+    A process is a reader from its first ``get`` on, until it closes the queue or ends.  If a reader
+    has no room, the item goes to the next one.  Use it for items that take equally long.  Items
+    that were sent to a reader are lost when it ends.  If that matters, or if items differ, use
+    ``SimpleQueue``: there each reader takes an item when it is ready for it.
 
-    A thread of the process that makes the queue deals the items.
+    A thread of the process that makes the queue sends the items.
     """
 
     _writer: Connection
@@ -279,16 +280,16 @@ class SimpleQueuePush(Generic[_T]):
 
     def __init__(self, *, ctx: Any = None) -> None:
         inbox, outbox = one_way.pair()
-        arrivals, door = LocalChannel.pair()
+        arrivals, registration = LocalChannel.pair()
         Dealer(inbox, arrivals).start()
-        self.__setstate__((Connection(outbox, readable=False), door))
+        self.__setstate__((Connection(outbox, readable=False), registration))
 
     def put(self, obj: _T) -> None:
-        """Put an item; waits for room while every reader has more than it can hold."""
+        """Put an item; wait while no reader has room."""
         self._writer.send(obj)
 
     def get(self) -> _T:
-        """The next of the items dealt to this process."""
+        """Return the next item that was sent to this process."""
         item: _T = self._joined().recv()
         return item
 
@@ -297,27 +298,27 @@ class SimpleQueuePush(Generic[_T]):
         return not self._joined().poll()
 
     def close(self) -> None:
-        """Put and get no more in this process."""
+        """Close the queue for this process."""
         self._writer.close()
-        self._door.close()
+        self._registration.close()
         if self._reader is not None:
             self._reader.close()
 
     def _joined(self) -> Connection:
-        with self._joining:  # two would be two readers, of which one is never asked
+        with self._joining:  # two threads would make two readers, one of which never reads
             if self._reader is None:
-                self._reader = Connection(arrive(self._door), writable=False)
+                self._reader = Connection(arrive(self._registration), writable=False)
         return self._reader
 
     def __getstate__(self) -> tuple[Any, ...]:
-        return self._writer, self._door
+        return self._writer, self._registration
 
     def __setstate__(self, state: tuple[Any, ...]) -> None:
-        self._writer, self._door = state
+        self._writer, self._registration = state
         self._reader = None
         self._joining = threading.Lock()
         util.register_after_fork(self, SimpleQueuePush._after_fork)
 
     def _after_fork(self) -> None:
-        self._reader = None  # the parent reads that one
+        self._reader = None  # it is the parent's
         self._joining = threading.Lock()

@@ -1,8 +1,8 @@
 """Pickling of objects: plain pickle first, cloudpickle where that fails.
 
-multiprocessing's ``ForkingPickler`` and its registered reducers are used as they are, so that what
-pickles there pickles here.  Lambdas, closures and classes of an interactive session, which do not
-pickle there, travel by value.
+multiprocessing's ``ForkingPickler`` and its registered reducers are used unchanged.  So an object
+that pickles with multiprocessing pickles here.  Lambdas, closures and classes of an interactive
+session do not pickle there.  Here they travel by value.
 """
 
 from __future__ import annotations
@@ -64,18 +64,18 @@ _BREADTH = 1000
 
 
 class PayloadDescriptor:
-    """A descriptor that travels with the start message, as the payload names it."""
+    """A descriptor that travels with the start message; its pickle is a number."""
 
     def __init__(self, index: int) -> None:
         self._index = index
 
     def detach(self) -> int:
-        """Return the descriptor itself, in the child and once."""
+        """Return the descriptor in the child.  This works once."""
         return child.take_descriptor(self._index)
 
 
 class PayloadSegment(PayloadDescriptor):
-    """The same for shared memory, of which each block has a handle."""
+    """A descriptor of shared memory, for which the payload may have several handles."""
 
     def detach(self) -> int:
         """Return a duplicate of the descriptor, in the child."""
@@ -93,7 +93,7 @@ class Spawning:
         self._segments: dict[int, PayloadSegment] = {}
 
     def inherit_segment(self, segment: Segment) -> PayloadSegment:
-        """Send its descriptor along, once."""
+        """Send the segment's descriptor along, once."""
         inherited = self._segments.get(segment.inode)
         if inherited is None:
             inherited = PayloadSegment(self.duplicate_for_child(segment.fileno()))
@@ -106,7 +106,7 @@ class Spawning:
         return len(self.fds) - 1
 
     def forget(self) -> None:
-        """Drop what was collected: the object is pickled anew, in another way."""
+        """Drop the collected descriptors: the object is pickled again, in another way."""
         self.fds.clear()
         self._segments.clear()
         handles.undo_pickling()
@@ -118,11 +118,11 @@ def spawning() -> Any:
 
 
 def dump_process(process: Any, *, same_host: bool) -> tuple[bytes, list[Descriptor]]:
-    """Pickle a Process that is being started; on the same host its descriptors go along."""
+    """Pickle a Process that is being started, with its descriptors on the same host."""
     try:
         return _dump_process(process, Spawning(process) if same_host else RemoteSpawning(process))
     finally:
-        mp_context.set_spawning_popen(None)  # again: the first time may have been interrupted
+        mp_context.set_spawning_popen(None)  # again: the call below may have been interrupted
 
 
 def _dump_process(process: Any, popen: Any) -> tuple[bytes, list[Descriptor]]:
@@ -136,7 +136,7 @@ def _dump_process(process: Any, popen: Any) -> tuple[bytes, list[Descriptor]]:
         finally:
             fds.clear()
     except BaseException:
-        fds.clear()  # now: the traceback, which holds them, may be kept for long
+        fds.clear()  # now: a traceback that is kept would keep them open
         raise
     finally:
         mp_context.set_spawning_popen(None)
@@ -145,8 +145,8 @@ def _dump_process(process: Any, popen: Any) -> tuple[bytes, list[Descriptor]]:
 def dump_shared(obj: Any, *, same_host: bool) -> bytes | None:
     """Pickle ``obj`` once for several Processes that are to be started.
 
-    None if that cannot be: descriptors and grants in it are for one process each; and what does not
-    pickle at all is the error of whoever starts the first.
+    Return None if each process needs a separate pickle, since descriptors and grants are for one
+    process.  Also return None if it does not pickle: the start of the first process raises that.
     """
     attempt: Any = Spawning(None) if same_host else RemoteSpawning(None)
     try:
@@ -164,7 +164,7 @@ def dump_shared(obj: Any, *, same_host: bool) -> bytes | None:
 
 
 def _blame_process(process: Any, reason: Exception) -> UnpicklableError:
-    """The error that names what of a Process does not pickle."""
+    """Return the error that names the part of a Process that does not pickle."""
     parts = {"the target": process._target}
     parts |= {f"argument {index}": value for index, value in enumerate(process._args)}
     parts |= {f"argument {name!r}": value for name, value in process._kwargs.items()}
@@ -174,10 +174,10 @@ def _blame_process(process: Any, reason: Exception) -> UnpicklableError:
 
 
 def blame(parts: Mapping[str, Any], reason: Exception, whole: str = "") -> Exception:
-    """The error to raise when ``parts`` of ``whole``, by what they are called, did not pickle.
+    """Return the error to raise when ``parts`` of ``whole``, which have names, did not pickle.
 
-    It names the culprit and the way to it.  A ``reason`` that is no pickler's refusal, but an error
-    of the user's own, is returned as it is.
+    It names the culprit and the path to it.  If ``reason`` is not a pickler's refusal but an error
+    in the user's code, return it unchanged.
     """
     if not isinstance(reason, REFUSALS):
         return reason
@@ -197,12 +197,12 @@ def _name_culprit(parts: Mapping[str, Any], whole: str, reason: Exception) -> Un
 
 
 def _refusal(obj: Any) -> str | None:
-    """Why ``obj`` does not pickle; None if it does."""
+    """Return the reason why ``obj`` does not pickle; None if it does."""
     pickling = handles.begin_pickling()
     try:
         dumps(obj)
     except Exception as error:
-        # The error itself would keep what our callers hold, in a cycle.
+        # The text only: the error would keep the frames of the callers alive, in a cycle.
         return str(error)
     finally:
         pickling.take_back()
@@ -211,11 +211,11 @@ def _refusal(obj: Any) -> str | None:
 
 
 def _way_to_culprit(obj: Any) -> str:
-    """From ``obj`` to the innermost part that does not pickle, as Python spells it."""
+    """Return the path from ``obj`` to the innermost part that does not pickle, as Python code."""
     way = ""
-    for _ in range(_DEPTH):  # what refers to itself has no innermost part
+    for _ in range(_DEPTH):  # an object that refers to itself has no innermost part
         if type(obj).__module__.startswith("multiprocessing."):
-            break  # its parts say nothing to the user, and pickling a connection leaves descriptors
+            break  # users do not know its parts, and pickling a connection leaves descriptors
         for step, part in islice(_parts(obj), _BREADTH):
             if _refusal(part) is not None:
                 way, obj = way + step, part
@@ -235,7 +235,7 @@ def _parts(obj: Any) -> Iterator[tuple[str, Any]]:
 
 
 class RemoteSpawning:
-    """Marks a start on another host: multiprocessing's checks pass, no descriptor can go along."""
+    """Mark of a start on another host: multiprocessing's checks pass, descriptors are refused."""
 
     other_host = True
 
@@ -244,7 +244,7 @@ class RemoteSpawning:
         self.fds: list[Descriptor] = []
 
     def duplicate_for_child(self, fd: int) -> int:
-        """Refuse."""
+        """Refuse: a descriptor is valid on its host only."""
         raise pickle.PicklingError(
             f"it is or holds descriptor {fd}, which cannot go to a process on another host. Use "
             "fiber.Pipe, fiber.Queue or fiber.Array instead of multiprocessing's or a socket, or "
@@ -252,7 +252,7 @@ class RemoteSpawning:
         )
 
     def forget(self) -> None:
-        """Drop what was collected: the object is pickled anew, in another way."""
+        """Drop the collected grants: the object is pickled again, in another way."""
         handles.undo_pickling()
 
     DupFd = duplicate_for_child
@@ -267,14 +267,14 @@ def dumps(
 ) -> bytes:
     """Pickle ``obj``, by reference where possible.
 
-    What lives in a ``__main__`` that the reader cannot import goes by value.
+    Objects of ``__main__`` go by value if the reader cannot import that module.
     """
     try:
         data = _dump(_Forking, obj, protocol, buffer_callback)
         if not (main_is_out_of_reach() and b"__main__" in data):
             return data
     except Exception:
-        # Whether or not cloudpickle can do it, its error says as much.
+        # cloudpickle tries next.  If it fails, too, its error gives the reason.
         pass
     before_retry()
     return _dump(_by_value_pickler(), obj, protocol, buffer_callback)
@@ -313,7 +313,7 @@ def _encode(obj: Any) -> tuple[bytes, list[memoryview]]:
         if not (main_is_out_of_reach() and b"__main__" in encoded[0]):
             return encoded
     except Exception:
-        # Whether or not cloudpickle can do it, its error says as much.
+        # cloudpickle tries next.  If it fails, too, its error gives the reason.
         pass
     handles.undo_pickling()
     return packet.dumps(obj, partial(_dump, _by_value_pickler()))
@@ -340,9 +340,9 @@ def dump(obj: Any, file: Any, protocol: int | None = None) -> None:
 def main_is_out_of_reach() -> bool:
     """Tell whether objects of ``__main__`` must travel by value.
 
-    They must if the processes that read our pickles cannot import ``__main__``, or must not.
+    They must if the readers of the pickles cannot import ``__main__``, or must not import it.
     """
-    if _readers_are_remote or "ps1" in vars(sys):  # what an interactive session adds has no file
+    if _readers_are_remote or "ps1" in vars(sys):  # an interactive session has no file
         return True
     main = vars(sys.modules["__main__"])
     spec = main.get("__spec__")
@@ -353,15 +353,15 @@ def main_is_out_of_reach() -> bool:
 def _importable(name: str | None, file: str | None) -> bool:
     """Tell whether a main module can be imported as ``__mp_main__``, by name if it has one."""
     if name is not None:
-        # To import the one of a package, folder or archive is to run it: few have a guard.
+        # Importing the __main__ of a package, folder or archive runs it: few have a guard.
         return name.rpartition(".")[2] != "__main__"
-    # A program that came by standard input calls its file <stdin>.
+    # A program from standard input has the file name <stdin>.
     started_in: str = mp_process.ORIGINAL_DIR or ""  # type: ignore[attr-defined]
     return file is not None and os.path.isfile(os.path.join(started_in, file))
 
 
 def readers_are_remote(remote: bool) -> None:
-    """Our processes run on other hosts (or no longer do): what is in ``__main__`` goes by value."""
+    """Note whether processes run on other hosts: if so, objects of ``__main__`` go by value."""
     global _readers_are_remote
     _readers_are_remote = remote
 
@@ -391,7 +391,7 @@ def _by_value_pickler() -> Any:
 
 
 def _reduce_file(file: io.TextIOWrapper) -> Any:
-    """Refuse open files, of which cloudpickle would make copies in memory."""
+    """Refuse open files.  Without this, cloudpickle would copy their contents."""
     for name in ("stdout", "stderr"):
         if file is getattr(sys, name):
             return getattr, (sys, name)
@@ -422,6 +422,9 @@ _SHARED_BY_MULTIPROCESSING = (
 
 
 def _is_of_multiprocessing(error: RuntimeError) -> bool:
-    """Return whether multiprocessing complains about start methods, which are not the reason."""
+    """Return whether this is multiprocessing's error for its locks and queues.
+
+    Its text blames the start method, which is not the reason here.
+    """
     text = str(error)
     return "SemLock" in text or "through inheritance" in text

@@ -1,4 +1,4 @@
-"""multiprocessing's tracker of named shared memory.  Fiber itself has nothing for it to track."""
+"""multiprocessing's tracker of named shared memory, which Fiber does not use."""
 
 from multiprocessing.resource_tracker import ensure_running, register, unregister
 

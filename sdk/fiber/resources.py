@@ -1,4 +1,4 @@
-"""`fiber.meta`: what a function wishes from the machine that runs it."""
+"""`fiber.meta`: a function's wishes for the host that runs it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["Resources", "largest", "merged", "meta", "resources_of", "wished", "
 
 _ATTRIBUTE = "__fiber_meta__"
 _RUN_BY_A_MANAGER = "_run_server"
-"""Name of the function of a multiprocessing manager's class that runs in its process."""
+"""Name of the method of a manager's class that runs in the server's process."""
 _F = TypeVar("_F", bound=Callable[..., Any])
 _N = TypeVar("_N", int, float)
 _V = TypeVar("_V", int, str)
@@ -23,7 +23,7 @@ _V = TypeVar("_V", int, str)
 
 @dataclass(frozen=True, slots=True)
 class Resources:
-    """Wishes of a function; None is no wish."""
+    """Wishes of a function; None stands for no wish."""
 
     cpu: float | None = None
     """CPUs, fractions allowed."""
@@ -32,7 +32,7 @@ class Resources:
     gpu: int | None = None
     """GPUs."""
     pool: str | None = None
-    """The FiberPool whose pods are meant; None: one of the program's own."""
+    """Name of the FiberPool whose pods to use; None: a FiberPool that the program makes."""
     extended: _wishes.Counts = ()
     """Extended resources and how many of each."""
     node_selector: _wishes.Pairs = ()
@@ -50,7 +50,7 @@ def meta(
     node_selector: Mapping[str, str] | None = None,
     tolerations: Sequence[str | Mapping[str, Any]] | None = None,
 ) -> Callable[[_F], _F]:
-    """Give a function wishes for resources, heeded by backends that can grant them.
+    """Give a function wishes for resources.  Backends with such resources fulfil them.
 
     `cpu` counts CPUs (2, 0.5, "500m"), `memory` is in MiB or has a unit (512, "512Mi",
     "2Gi"), `gpu` counts GPUs of NVIDIA. `resources` counts any other extended resource of
@@ -58,13 +58,12 @@ def meta(
     run it, as `{"disk": "ssd"}`. `tolerations` has the taints that these nodes may have, as
     kubectl writes them (`["spot", "team=a:NoSchedule"]`) or as dicts of a pod's spec.
 
-    The wishes are the returned function's alone: the one that was
-    passed in stays as it was, so `small = fiber.meta(cpu=1)(f)` and `large =
-    fiber.meta(cpu=8)(f)` may be used side by side. Wishes for a function that has some are
-    added to them, the outer ones winning. What is returned behaves and pickles like the
-    original.
+    Only the returned function has the wishes. The original function stays unchanged, so
+    `small = fiber.meta(cpu=1)(f)` and `large = fiber.meta(cpu=8)(f)` may be used side by
+    side. If the function has wishes already, the new ones are added, and win where both have
+    a value. The result behaves and pickles like the original.
 
-    A manager's class may be given wishes too: they are those of the process that serves it.
+    A manager's class may have wishes, too: they are for the process of its server.
     """
     placement = {"resources": resources, "node_selector": node_selector, "tolerations": tolerations}
     wishes = wished("fiber.meta", cpu, memory, gpu, **placement)
@@ -101,7 +100,7 @@ def wished(
     node_selector: object = None,
     tolerations: object = None,
 ) -> Resources:
-    """Wishes as a person spells them, see ``meta``; ``where`` is what errors call the place."""
+    """Read wishes as users write them for ``meta``; ``where`` names the call in errors."""
 
     def read(name: str, value: object, reader: Callable[[object], Any], default: Any) -> Any:
         if value is None:
@@ -122,7 +121,7 @@ def wished(
 
 
 def resources_of(function: Callable[..., Any]) -> Resources:
-    """The wishes of a function, method or functools.partial; all None if it has none."""
+    """Return the wishes of a function, method or functools.partial."""
     while isinstance(function, functools.partial):
         function = function.func
     wishes = getattr(function, _ATTRIBUTE, None)
@@ -130,7 +129,7 @@ def resources_of(function: Callable[..., Any]) -> Resources:
 
 
 def with_resources(function: _F, wishes: Resources) -> _F:
-    """`function` with these wishes, for whoever has them in hand."""
+    """Return `function` with these wishes; unchanged if there are none."""
     result: _F = function if wishes == Resources() else _attach(function, wishes)
     return result
 
@@ -138,7 +137,7 @@ def with_resources(function: _F, wishes: Resources) -> _F:
 def largest(wishes: Iterable[Resources]) -> Resources:
     """Return the largest wish for each resource, and the nodes that suit all wishes.
 
-    They have no pool. ValueError if two wish different values of one label of a node.
+    The result has no pool. ValueError if two wish different values of one node label.
     """
     total = Resources()
     for one in wishes:
@@ -186,14 +185,13 @@ def _merged(
 
 # ---- attaching ------------------------------------------------------------------------------
 #
-# Setting an attribute on the function would leak the wishes to everybody who uses it under
-# its old name. What to return instead depends on how the function can be pickled:
+# An attribute of the function would give the wishes to all users of the original name. The
+# result depends on how the function can be pickled:
 #
-# * Decorator syntax: its name is not bound yet and will be bound to the result. A copy of the
-#   function is a function like any other then, found by pickle under that name.
-# * Everything else (bound already, or no Python function at all): pickle would find the
-#   original under the name, and can be told nothing about function objects. So the result is
-#   an object, which pickles as "the original, with these wishes".
+# * Decorator syntax: the name is not bound yet, and will be bound to the result. So the result
+#   is a copy of the function, which pickle finds under that name.
+# * All other cases (a bound name, or no Python function): pickle would find the original under
+#   the name. So the result is an object that pickles as "the original, with these wishes".
 
 
 def _attach(function: Callable[..., Any], wishes: Resources) -> Any:
@@ -228,7 +226,7 @@ def _copy(function: types.FunctionType) -> types.FunctionType:
 
 
 class _FunctionWithWishes:
-    """A callable that is another one with wishes of its own."""
+    """Callable that calls another one, and has wishes."""
 
     def __init__(self, function: Callable[..., Any], wishes: Resources) -> None:
         functools.update_wrapper(self, function)
@@ -239,7 +237,7 @@ class _FunctionWithWishes:
         return self._function(*args, **kwargs)
 
     def __get__(self, instance: object, owner: type | None = None) -> Any:
-        # As a class attribute, a method exactly where the original would be one.
+        # As a class attribute it is a method if the original would be one.
         if instance is None or not hasattr(self._function, "__get__"):
             return self
         return types.MethodType(self, instance)
@@ -248,8 +246,8 @@ class _FunctionWithWishes:
         return f"<{self._function!r} with {resources_of(self)}>"
 
     def __reduce__(self) -> Any:
-        # After `f = fiber.meta(cpu=1)(f)` the original has no name left, and this has it.
-        # __main__ is another module in other processes: there, by value.
+        # After `f = fiber.meta(cpu=1)(f)` this object has the name of the original.
+        # In other processes __main__ is another module, so such functions go by value.
         name: str | None = getattr(self, "__qualname__", None)
         if name and self.__module__ != "__main__" and _is_bound_to_its_name(self):
             return name

@@ -1,7 +1,7 @@
 """Results of a pool's calls: objects to wait for, and iterators.
 
-As in ``multiprocessing.pool``, with what that leaves open promised: a result of a pool that is
-terminated or cannot go on raises an error instead of waiting for ever.
+As in ``multiprocessing.pool``, with one more promise: if the pool is terminated or cannot go on,
+its results raise an error.  In multiprocessing they may wait for ever.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _ErrorCallback = Callable[[BaseException], object]
 
 
 class Keeper(Protocol):
-    """Part of a pool that an iterator needs.  It keeps the pool while results are to come."""
+    """Part of a pool or executor that an iterator needs, and keeps alive until its last result."""
 
     def _check_may_wait(self) -> None:
         """Raise RuntimeError on a thread that must not wait for a result."""
@@ -42,14 +42,14 @@ class ResultPool(Keeper, Protocol):
     """Part of a pool that a result needs."""
 
     def _calls_back_here(self) -> bool:
-        """Return whether the caller is a callback, on the thread of all callbacks."""
+        """Return whether the caller runs on the thread of the callbacks."""
 
     def _call_back(self, action: Callable[[], None]) -> bool:
-        """Have a callback run; False if none runs any more."""
+        """Run a callback on its thread; return False if callbacks are over."""
 
 
 class ApplyResult(Generic[_T]):
-    """The result of one call, as ``apply_async`` returns it."""
+    """Result of one call, as ``apply_async`` returns it."""
 
     def __init__(
         self,
@@ -57,18 +57,18 @@ class ApplyResult(Generic[_T]):
         callback: Callable[[_T], object] | None = None,
         error_callback: _ErrorCallback | None = None,
     ) -> None:
-        # Keeps the pool while there is something to wait for, as in multiprocessing.
+        # As in multiprocessing, a result keeps its pool alive until it is there.
         self._pool: ResultPool | None = pool
         self._callback = callback
         self._error_callback = error_callback
         self._outcome: Any = None
         self._mixed = False
         self._done = Latch()
-        """The outcome is there, and the callback has run."""
+        """Set once the outcome is there and the callback has run."""
         calls_back = callback is not None or error_callback is not None
         self._arrived = Latch() if calls_back else self._done
-        """The outcome is there."""
-        # Reentrant: unpickling runs the user's code, which may ask for this very result.
+        """Set once the outcome is there."""
+        # Reentrant: unpickling runs the user's code, which may ask for this result.
         self._settling = threading.RLock()
 
     def ready(self) -> bool:
@@ -89,7 +89,7 @@ class ApplyResult(Generic[_T]):
             awaited.wait(timeout)
 
     def get(self, timeout: float | None = None) -> _T:
-        """The result, or the exception that the call raised; TimeoutError if there is neither."""
+        """Return the result or raise the call's exception; TimeoutError if neither is there."""
         self.wait(timeout)
         if not self.ready():
             raise _too_late(timeout)
@@ -115,7 +115,7 @@ class ApplyResult(Generic[_T]):
         """Do nothing: there is no bound."""
 
     def set_done(self) -> None:
-        """All outcomes are there: call back, then let those go on who wait."""
+        """Run the callback, then wake the waiters: all outcomes are there."""
         pool = self._pool
         if self._arrived is self._done or pool is None:
             self._complete()
@@ -141,10 +141,10 @@ class ApplyResult(Generic[_T]):
             self._complete()
 
     def _awaited(self) -> Latch:
-        """Return what the calling thread waits for.
+        """Return the latch that the calling thread waits for.
 
-        Callbacks run one after the other: one that waits for a result cannot wait for the callback
-        of that result, too.
+        Callbacks run one after the other.  So a callback that waits for a result does not wait for
+        the callback of that result.
         """
         pool = self._pool
         if self._arrived is self._done or pool is None or not pool._calls_back_here():
@@ -162,7 +162,7 @@ class ApplyResult(Generic[_T]):
         return self._outcome
 
     def _settle(self) -> None:
-        """Unpickle what still is; on one thread."""
+        """Unpickle the outcome, if it is still pickled.  One thread at a time calls this."""
         if self._mixed:
             self._outcome = decode(self._outcome)
             self._mixed = False
@@ -181,14 +181,14 @@ def _check_may_wait(pool: Keeper | None, timeout: float | None) -> None:
 
 def _too_late(timeout: float | None) -> TimeoutError:
     return TimeoutError(
-        f"no result within {timeout} s; its task goes on, and its result can still be waited for"
+        f"no result within {timeout} s. The task goes on: call again to wait for its result"
     )
 
 
 class MapResult(ApplyResult[list[_T]]):
-    """The results of a map, as ``map_async`` returns it.
+    """Results of a map, as ``map_async`` returns them.
 
-    If tasks raised, it raises what the first of them, in time, did; once all are done.
+    If tasks raised, ``get`` raises the exception that came first in time, once all tasks are done.
     """
 
     def __init__(
@@ -216,7 +216,7 @@ class MapResult(ApplyResult[list[_T]]):
     def _settle(self) -> None:
         if not self._mixed:
             return
-        # In this order: whoever is interrupted at any line begins again here, with what is left.
+        # In this order: after an interruption at any line, the next call does what is left.
         if self._first is None:
             self._first = _unpickle(self._outcome)
         if self._first is not None:
@@ -225,7 +225,7 @@ class MapResult(ApplyResult[list[_T]]):
 
 
 def _unpickle(outcomes: list[Any]) -> TaskFailure | None:
-    """Unpickle in place what is pickled, up to the first failure, which stays pickled there."""
+    """Unpickle outcomes in place, up to the first failure, which stays pickled there."""
     for at, outcome in enumerate(outcomes):
         if type(outcome) is Pickled:
             value = outcome.decode()
@@ -236,29 +236,29 @@ def _unpickle(outcomes: list[Any]) -> TaskFailure | None:
 
 
 HELD = 64 << 20
-"""Bytes of results, as workers sent them, that an iterator holds for somebody who does not read
-them.  Then no more tasks are begun until half of the results are read."""
+"""Bytes of unread results, as workers sent them, from which on an iterator pauses its tasks until
+half of the results are read."""
 
 
 class _ResultBuffer:
-    """Results on their way to an iterator: what the executor fills and the iterator empties."""
+    """Results on their way to an iterator: the executor adds them, the iterator takes them."""
 
     def __init__(self, pool: Keeper) -> None:
         self.items: deque[Any] = deque()
         self.finished = False
         self.stream: InputStream | None = None
-        """Reader that reads no more than is consumed, if that was asked for."""
+        """Input of an ``imap`` with ``buffersize``, which reads on as results are consumed."""
         self.pool: Keeper | None = pool
         self.resume: Callable[[], None] | None = None
-        """Function that asks the executor for more, after ``add_results`` asked for no more."""
+        """Function that ends the pause of the job that ``add_results`` asked for."""
         self._waiters = Waiters()
         self._abandoned = False
         self._bounded = True
         self._passed = 0  # results that were put into ``items``
-        self._held = 0  # bytes, of which some may have been taken since it was last looked
+        self._held = 0  # bytes; some of them may have been taken since the last count
         self._sizes: deque[tuple[int, int]] = deque()
         """Pairs: number of results passed on so far, and bytes of those since the pair before."""
-        self._resume_at = -1  # results that are left then; -1: nothing is held back
+        self._resume_at = -1  # unread results at which the pause ends; -1: no pause
 
     def add_results(self, start: int, outcomes: list[Any], mixed: bool, size: int = 0) -> bool:
         """Take outcomes."""
@@ -275,7 +275,7 @@ class _ResultBuffer:
     def _pass_on(self, outcomes: list[Any], size: int) -> None:
         self.items.extend(outcomes)
         self._passed += len(outcomes)
-        if self._sizes and self._sizes[-1][1] < HELD >> 10:  # else they take more than the results
+        if self._sizes and self._sizes[-1][1] < HELD >> 10:  # keeps the pairs few
             size += self._sizes.pop()[1]
         self._sizes.append((self._passed, size))
 
@@ -287,10 +287,10 @@ class _ResultBuffer:
         if self._held < HELD or not self._bounded:
             return False
         held_back = self._resume_at >= 0
-        # Noted first: whoever takes results while they are counted asks for more.
+        # Set before the count: a reader that takes results during the count ends the pause.
         self._resume_at = max(self._resume_at, len(self.items) // 2)
         if held_back:
-            return True  # until half of them are read, and not before
+            return True  # the pause goes on until half of them are read
         consumed = self.consumed()
         while self._sizes and self._sizes[0][0] <= consumed:
             self._held -= self._sizes.popleft()[1]
@@ -308,12 +308,12 @@ class _ResultBuffer:
         return True
 
     def lift_bound(self) -> None:
-        """Take all that comes."""
+        """Ask for no pause from now on."""
         self._bounded = False
         self._resume_at = -1
 
     def abandon(self) -> None:
-        """Drop the results, and hold back no task for them: the reader has gone.  From anywhere."""
+        """Drop the results and end the pause: the reader has gone.  Runs on any thread."""
         self._abandoned = True
         if self.resume is not None:
             self.resume()
@@ -323,10 +323,10 @@ class _ResultBuffer:
         self._sizes.clear()
 
     def ask(self) -> None:
-        """Have the executor go on, if it waits until results are read.
+        """Ask the executor to go on, if it waits until results are read.
 
-        Changes nothing here, and is called after each result and before each wait: whoever is
-        interrupted after the one makes up for it before the other.
+        This changes no state, and runs after each result and before each wait.  If a reader is
+        interrupted in the first call, the second makes up for it.
         """
         stream = self.stream
         if stream is not None:
@@ -335,10 +335,10 @@ class _ResultBuffer:
             self.resume()
 
     def set_done(self) -> None:
-        """All outcomes are there."""
+        """Note that all outcomes are there, and wake the readers."""
         self.finished = True
         self.pool = None
-        self.stream = None  # which knows this, too
+        self.stream = None  # it has ended, too
         self._waiters.wake()
 
     def set_exception(self, error: BaseException) -> None:
@@ -347,11 +347,11 @@ class _ResultBuffer:
         self.set_done()
 
     def wait(self, timeout: float | None) -> Any:
-        """The next outcome; StopIteration at the end, TimeoutError if it takes too long."""
+        """Return the next outcome; StopIteration at the end, TimeoutError after ``timeout``."""
         deadline = None if timeout is None else time.monotonic() + timeout
         while True:
             waiter = self._waiters.join()
-            finished = self.finished  # the last items come before it
+            finished = self.finished  # read before the items: the last items come before it
             with contextlib.suppress(IndexError):  # other threads take them, too
                 outcome = self.items.popleft()
                 self._waiters.leave(waiter)
@@ -373,7 +373,7 @@ class _OrderedResultBuffer(_ResultBuffer):
         self._early: dict[int, tuple[list[Any], int]] = {}
 
     def _keep(self, start: int, outcomes: list[Any], size: int) -> None:
-        """Pass on what is next in order."""
+        """Pass on the outcomes that are next in order."""
         self._early[start] = outcomes, size
         while (ready := self._early.pop(self._passed, None)) is not None:
             self._pass_on(*ready)
@@ -384,7 +384,7 @@ class _OrderedResultBuffer(_ResultBuffer):
 
 
 class IMapIterator(Iterator[_T]):
-    """Iterator over the results of ``imap``, in order."""
+    """Iterator over the results of ``imap``, in the order of their tasks."""
 
     _buffer_type: type[_ResultBuffer] = _OrderedResultBuffer
     _cancel: Callable[[], None] | None = None
@@ -396,7 +396,7 @@ class IMapIterator(Iterator[_T]):
         return self
 
     def next(self, timeout: float | None = None) -> _T:
-        """The next result; TimeoutError if it takes longer than ``timeout`` seconds."""
+        """Return the next result; TimeoutError if it takes longer than ``timeout`` seconds."""
         outcome = self._take(timeout)
         if type(outcome) is TaskFailure:
             raise fresh(outcome.error)
@@ -406,7 +406,7 @@ class IMapIterator(Iterator[_T]):
     __next__ = next
 
     def _take(self, timeout: float | None) -> Any:
-        """The next result or Failure; what is raised is not a task's."""
+        """Return the next result or TaskFailure; errors of tasks are not raised here."""
         buffer = self._buffer
         try:
             outcome = buffer.items.popleft()
@@ -422,7 +422,7 @@ class IMapIterator(Iterator[_T]):
         iterable: Iterable[Any],
         buffersize: int | None,
     ) -> None:
-        """Have ``item``, whose future the buffer is, map ``iterable``."""
+        """Start the map of ``iterable``: ``item`` has this buffer as its future."""
         buffer = self._buffer
         buffer.resume = partial(executor.resume, item)
         if buffersize is None and isinstance(iterable, (*SLICEABLE, list)):
@@ -435,7 +435,7 @@ class IMapIterator(Iterator[_T]):
                 buffer.stream = stream
                 self._cancel = partial(executor.cancel, item)
             executor.read(item, iterable)
-        except BaseException:  # a stream that nobody reads would be waited for
+        except BaseException:  # the executor would wait for a stream without a reader
             executor.cancel(item)
             raise
 
@@ -445,7 +445,7 @@ class IMapIterator(Iterator[_T]):
             return
         if self._cancel is None:
             buffer.abandon()
-        else:  # nobody can make room any more for what was not read yet
+        else:  # without a reader there will be no room for the unread input
             self._cancel()
             buffer.stream = None
 

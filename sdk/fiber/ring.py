@@ -4,7 +4,7 @@
 
     def train(rank, size):
         ring = fiber.ring.current()
-        theirs = ring.exchange(mine)  # to the next member, and from the previous one
+        received = ring.exchange(sent)  # to the next member, and from the previous one
 
     fiber.Ring(4, train).run()
 """
@@ -32,14 +32,14 @@ _member: Member | None = None
 
 
 def current() -> Member:
-    """The member of a ring that this process is; RuntimeError if it is none."""
+    """Return the member of a ring that this process is; RuntimeError if it is no member."""
     if _member is None:
         raise RuntimeError("this process is no member of a ring: fiber.Ring(...).run() starts some")
     return _member
 
 
 class _End(NamedTuple):
-    """Message to members about one that has ended."""
+    """Message to members about a member that has ended."""
 
     rank: int
     lost: bool
@@ -47,7 +47,7 @@ class _End(NamedTuple):
 
 
 class Member:
-    """A process of a ring: its ``rank``, from 0, among ``size``, and the way to its neighbours."""
+    """A process of a ring: its ``rank``, from 0, among ``size``, and links to its neighbours."""
 
     def __init__(
         self, rank: int, size: int, to_next: Connection, from_previous: Connection, news: Connection
@@ -61,15 +61,16 @@ class Member:
 
     @property
     def lost(self) -> dict[int, str]:
-        """The ranks of those that are lost, as far as is known by now, and how each ended."""
+        """Ranks of the members that are known to be lost, and how each ended."""
         while self._news.poll():
-            self._hear()
+            self._receive_end()
         return {end.rank: end.how for end in self._ends.values() if end.lost}
 
     def send(self, obj: Any) -> None:
-        """Send to the next member; MemberLost if that one has ended.
+        """Send to the next member; MemberLost if it has ended.
 
-        Above 256 KiB this waits until it is received: where all members send, use ``exchange``.
+        Above 256 KiB this waits until the object is received.  If all members send, use
+        ``exchange``.
         """
         try:
             self._next.send(obj)
@@ -79,7 +80,7 @@ class Member:
     def recv(self) -> Any:
         """Receive from the previous member.
 
-        MemberLost if nothing will come of it, or if any member is lost while this one waits.
+        MemberLost if the previous member has ended, or if any member is lost meanwhile.
         """
         while not self._previous.poll():
             for rank, how in self.lost.items():
@@ -91,34 +92,37 @@ class Member:
             self._await_end((self.rank - 1) % self.size)
 
     def exchange(self, obj: Any) -> Any:
-        """Send to the next member and receive from the previous one, as all members do now."""
+        """Send to the next member and receive from the previous one.
+
+        All members must call this at the same step.
+        """
         if self.size == 1:
             return obj
         if self.rank % 2 == 0:
             self.send(obj)
             return self.recv()
-        received = self.recv()  # half of them do this first: else all could wait for each other
+        received = self.recv()  # half receive first: otherwise all could wait for each other
         self.send(obj)
         return received
 
     def _await_end(self, rank: int) -> NoReturn:
-        """Wait for the reason why a member ended, whose connection has closed, and raise it."""
+        """Wait for the message about a member whose connection has closed; raise MemberLost."""
         while rank not in self._ends:
-            self._hear()
+            self._receive_end()
         first = next((end for end in self._ends.values() if end.lost), self._ends[rank])
         raise MemberLost(first.rank, first.how)
 
-    def _hear(self) -> None:
+    def _receive_end(self) -> None:
         end: _End = self._news.recv()
         self._ends[end.rank] = end
 
 
 class Ring(Generic[_T]):
-    """So many ``processes``, each of which calls ``func(rank, size)``.
+    """A number of ``processes``, each of which calls ``func(rank, size)``.
 
-    Before, each calls ``initializer(member, *initargs)`` with its ``Member``, which ``current()``
-    returns from then on.  On Kubernetes members are in pods, which have what ``fiber.meta`` says
-    that ``func`` needs.
+    Before that, each calls ``initializer(member, *initargs)`` with its ``Member``, which
+    ``current()`` returns from then on.  On Kubernetes members are in pods, which have the resources
+    that ``fiber.meta`` wishes for ``func``.
     """
 
     def __init__(
@@ -140,10 +144,10 @@ class Ring(Generic[_T]):
         self._wishes = resources_of(func)
 
     def run(self) -> list[_T]:
-        """Start the members and wait until all have ended; returns their results, by rank.
+        """Start the members and wait until all have ended; return their results, by rank.
 
-        When one raises or is lost, the others are told, by a MemberLost where they wait for it,
-        and what ended the first is raised once all have ended.  Ctrl-C kills them.
+        When a member raises or is lost, members that wait for it get MemberLost.  Once all have
+        ended, ``run`` raises the first error.  Ctrl-C kills the members.
         """
         links = [Pipe(duplex=False) for _ in range(self.size)]
         channels = [Pipe() for _ in range(self.size)]
@@ -157,8 +161,8 @@ class Ring(Generic[_T]):
                 process.start()
                 processes.append(process)
             _close([end for link in links for end in link])
-            _close([theirs for _, theirs in channels])
-            return _attend([ours for ours, _ in channels])
+            _close([of_member for _, of_member in channels])
+            return _await_all([of_program for of_program, _ in channels])
         except BaseException:
             for process in processes:
                 process.kill()
@@ -169,8 +173,8 @@ class Ring(Generic[_T]):
             _close([end for pair in (*links, *channels) for end in pair])
 
 
-def _attend(channels: list[Connection]) -> list[Any]:
-    """Wait for all ends, and tell those of whom they concern."""
+def _await_all(channels: list[Connection]) -> list[Any]:
+    """Wait until all members have ended; report each end to the members that it concerns."""
     running = dict(enumerate(channels))
     results: list[Any] = [None] * len(channels)
     failure: BaseException | None = None
@@ -181,7 +185,7 @@ def _attend(channels: list[Connection]) -> list[Any]:
                 del running[rank]
                 end, results[rank], error = _outcome(rank, channel)
                 failure = error if failure is None else failure
-                _tell(end, running, len(channels))
+                _report(end, running, len(channels))
     if failure is not None:
         raise fresh(failure)
     return results
@@ -194,16 +198,16 @@ def _outcome(rank: int, channel: Connection) -> tuple[_End, Any, BaseException |
     except ConnectionClosed as closed:
         how = closed.reason or "its process ended"
         return _End(rank, True, how), None, MemberLost(rank, how)
-    except Exception as unreadable:  # what it is of cannot be imported here, for instance
-        add_note(unreadable, f"what member {rank} of the ring returned cannot be unpickled")
-        return _End(rank, True, "what it returned cannot be unpickled"), None, unreadable
+    except Exception as unreadable:  # its class cannot be imported here, for instance
+        add_note(unreadable, f"the result of member {rank} of the ring cannot be unpickled here")
+        return _End(rank, True, "its result cannot be unpickled"), None, unreadable
     if error is not None:
         add_note(error, f"raised by member {rank} of the ring")
         return _End(rank, True, f"it raised {type(error).__name__}: {error}"), None, error
     return _End(rank, False, "it has returned"), result, None
 
 
-def _tell(end: _End, running: dict[int, Connection], size: int) -> None:
+def _report(end: _End, running: dict[int, Connection], size: int) -> None:
     """Send a loss to all members, and any other end to the neighbours."""
     neighbours = {(end.rank - 1) % size, (end.rank + 1) % size}
     for rank in running if end.lost else neighbours & running.keys():

@@ -1,7 +1,7 @@
-"""multiprocessing's named shared memory, between the processes of one host.
+"""Named shared memory as in multiprocessing, between the processes of one host.
 
-multiprocessing has a process of its own, the resource tracker, that removes what nobody unlinked.
-Here that is done at the program's end by the agent of the host or, if it is killed, by the zygote.
+In multiprocessing a separate process, the resource tracker, removes memory that was not unlinked.
+Here the agent of the host does that at the program's end, or the zygote if the agent is killed.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ _mp: Any = mp_shared_memory
 class SharedMemory(mp_shared_memory.SharedMemory):
     """A block of memory that processes of this host find by its name.
 
-    ``create``: make it, with ``size`` bytes; FileExistsError if there is one of that name.
-    Otherwise FileNotFoundError if there is none.  It stays until ``unlink``; one that was made with
-    ``track`` goes at the program's end at the latest.
+    ``create``: make the block, with ``size`` bytes; FileExistsError if the name is taken.  Without
+    it the block must exist, or FileNotFoundError is raised.  A block stays until ``unlink``.  With
+    ``track`` it is removed at the program's end at the latest.
     """
 
     _track = False  # by multiprocessing
@@ -88,7 +88,7 @@ class SharedMemory(mp_shared_memory.SharedMemory):
         self._name = path
 
     def unlink(self) -> None:
-        """Take the name away; the memory goes when nobody has it open any more."""
+        """Remove the name.  The memory is freed when the last process has closed it."""
         if self._name:
             _posixshmem.shm_unlink(self._name)
             forget_memory(_directory(), self.name)
@@ -112,7 +112,7 @@ class ShareableList(mp_shared_memory.ShareableList[_T]):
         return _attach_list, (type(self), self.shm)
 
 
-# multiprocessing's makes its memory itself; this is the same, with ours.
+# multiprocessing's initializer, with Fiber's class for the memory that it makes.
 _init_list = types.FunctionType(
     mp_shared_memory.ShareableList.__init__.__code__,
     {**vars(mp_shared_memory), "SharedMemory": SharedMemory},

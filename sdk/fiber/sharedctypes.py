@@ -1,8 +1,8 @@
 """``Value``, ``Array`` and their raw forms: ctypes objects in memory that processes share.
 
-The classes are multiprocessing's own.  The memory has no name and no file, goes when nobody uses it
-any more, and is not bounded by the size of ``/dev/shm``.  The objects pickle at any time and not
-only while a process is started: through a queue, as a task's argument, to another host.
+The classes are multiprocessing's.  The memory has no name and no file, is freed with its last user,
+and is not bounded by the size of ``/dev/shm``.  The objects pickle at any time, and not only while
+a process is started: through a queue, as a task's argument, to another host.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from fiber.synchronize import LockLike
 
     Locked: TypeAlias = Literal[True] | LockLike
-    """Values of ``lock=`` for an object that is to have a lock."""
+    """Values of ``lock=`` for an object with a lock."""
     Size: TypeAlias = int | Sequence[Any]
     """Number of elements of an array, or their values."""
 
@@ -64,7 +64,7 @@ def RawValue(typecode_or_type: str, *args: Any) -> Any: ...
 
 
 def RawValue(typecode_or_type: Any, *args: Any) -> Any:
-    """A ctypes object in shared memory, made as ``type(*args)``; nothing guards it."""
+    """Return a ctypes object in shared memory, made as ``type(*args)``.  It has no lock."""
     value = _new(_type(typecode_or_type))
     value.__init__(*args)
     return value
@@ -79,7 +79,7 @@ def RawArray(typecode_or_type: str, size_or_initializer: Size) -> Any: ...
 
 
 def RawArray(typecode_or_type: Any, size_or_initializer: Size) -> Any:
-    """A ctypes array in shared memory, of zeros or of the values given; nothing guards it."""
+    """Return a ctypes array in shared memory, of zeros or of given values.  It has no lock."""
     element = _type(typecode_or_type)
     if isinstance(size_or_initializer, int):
         return _new(element * size_or_initializer)
@@ -119,9 +119,9 @@ def Value(
 
 
 def Value(typecode_or_type: Any, *args: Any, lock: Any = True, ctx: Any = None) -> Any:
-    """A ctypes object in shared memory, with a lock.
+    """Return a ctypes object in shared memory, with a lock.
 
-    ``lock``: True for a new ``RLock``, one of your own, or False for none, as ``RawValue``.
+    ``lock``: True for a new ``RLock``, an existing lock, or False for none, as ``RawValue``.
     """
     return _guarded(RawValue(typecode_or_type, *args), lock)
 
@@ -183,15 +183,15 @@ def Array(
     lock: Any = True,
     ctx: Any = None,
 ) -> Any:
-    """A ctypes array in shared memory, with a lock.
+    """Return a ctypes array in shared memory, with a lock.
 
-    ``lock``: True for a new ``RLock``, one of your own, or False for none, as ``RawArray``.
+    ``lock``: True for a new ``RLock``, an existing lock, or False for none, as ``RawArray``.
     """
     return _guarded(RawArray(typecode_or_type, size_or_initializer), lock)
 
 
 def copy(obj: _CT) -> _CT:
-    """A copy of a ctypes object, in shared memory."""
+    """Return a copy of a ctypes object, in shared memory."""
     new: _CT = _new(type(obj))
     ctypes.pointer(new)[0] = obj
     return new
@@ -222,7 +222,7 @@ def synchronized(
 
 
 def synchronized(obj: Any, lock: Any = None, ctx: Any = None) -> Any:
-    """A ctypes object with a lock: ``lock``, or a new ``RLock``."""
+    """Return a ctypes object with a lock: ``lock``, or a new ``RLock``."""
     guard: Any = synchronize.RLock() if lock is None else lock
     wrapper = mp_sharedctypes.synchronized(obj, guard, ctx=synchronize)
     copyreg.pickle(type(wrapper), _reduce_synchronized)
@@ -248,7 +248,7 @@ def _new(type_: Any) -> Any:
 
 
 def _placed(type_: Any, buffer: SharedBuffer) -> Any:
-    # multiprocessing notes the types of its own objects here, perhaps the same type as ours.
+    # multiprocessing registers the types of its objects here, perhaps the same type.
     ForkingPickler.register(type_, _reduce_ctype)
     copyreg.pickle(type_, _reduce_ctype)
     obj = type_.from_buffer(buffer.view)
@@ -261,7 +261,7 @@ def _placed(type_: Any, buffer: SharedBuffer) -> Any:
 
 def _reduce_ctype(obj: Any) -> tuple[Any, ...]:
     buffer = getattr(obj, "_wrapper", None)
-    if not isinstance(buffer, SharedBuffer):  # of a type that ours have, too
+    if not isinstance(buffer, SharedBuffer):  # multiprocessing's, of the same type
         reduced: tuple[Any, ...] = (
             obj.__reduce__() if buffer is None else mp_sharedctypes.reduce_ctype(obj)  # type: ignore[attr-defined]
         )

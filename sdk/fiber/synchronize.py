@@ -1,4 +1,4 @@
-"""Locks, semaphores and events: multiprocessing's, released when who holds them dies.
+"""Locks, semaphores and events as in multiprocessing; a dead holder's locks are released.
 
 ::
 
@@ -47,28 +47,28 @@ __all__ = [
 _T = TypeVar("_T")
 
 RECHECK = 1.0
-"""Seconds after which a waiter looks for itself: the process that should wake it may have died."""
+"""Seconds after which a waiter checks for itself: the process that should wake it may be dead."""
 
 
 class SemLock:
     """Base of all locks and semaphores: tokens that are acquired and released.
 
-    They pickle at any time and not only while a process is started: through a queue, as a task's
-    argument.  What a process has when it dies is released for it, with a RuntimeWarning that names
-    it; whoever acquires it then gets an ``Abandoned`` in place of True.
+    They pickle at any time: through a queue, or as a task's argument, and not only while a process
+    is started.  Tokens of a process that dies are released, with a RuntimeWarning that names the
+    process.  The next ``acquire`` then returns an ``Abandoned`` in place of True.
     """
 
     def __init__(self, kind: int, value: int, maximum: int) -> None:
         self._semlock: AnySemaphore = shared_semaphores.create(kind, value, maximum)
 
     def acquire(self, block: bool = True, timeout: float | None = None) -> bool:
-        """Take a token; False if there is none, nor within ``timeout`` seconds."""
+        """Take a token; return False if none becomes free within ``timeout`` seconds."""
         if timeout is not None and math.isnan(timeout):
             raise ValueError("timeout must be a number of seconds, not NaN")
         return self._semlock.acquire(block, timeout)
 
     def release(self) -> None:
-        """Give a token back; ValueError if there would be more than there can be."""
+        """Give a token back; ValueError if there would be more tokens than the maximum."""
         self._semlock.release()
 
     def __enter__(self) -> bool:
@@ -105,8 +105,8 @@ def _rebuild(cls: type[SemLock], semlock: AnySemaphore) -> SemLock:
 class Semaphore(SemLock):
     """A count that ``acquire`` lowers, waiting while it is zero, and ``release`` raises.
 
-    If some process releases it more often than it acquired it, it carries signals from one process
-    to another, and nothing is released for a process that dies.
+    If a process releases it more often than it acquired it, the semaphore carries signals between
+    processes.  From then on no token of a process that dies is released.
     """
 
     def __init__(self, value: int = 1, *, ctx: Any = None) -> None:
@@ -114,7 +114,7 @@ class Semaphore(SemLock):
         super().__init__(COUNTING, value, SEM_VALUE_MAX)
 
     def get_value(self) -> int:
-        """The count now."""
+        """Return the present count."""
         return self._semlock._get_value()
 
     @staticmethod
@@ -131,7 +131,7 @@ class Semaphore(SemLock):
 
 
 class BoundedSemaphore(Semaphore):
-    """A semaphore whose count never rises above where it started."""
+    """A semaphore whose count never rises above its first value."""
 
     def __init__(self, value: int = 1, *, ctx: Any = None) -> None:
         self._check(value)
@@ -153,9 +153,9 @@ class Lock(SemLock):
 
 
 class RLock(SemLock):
-    """A mutex that its thread may acquire again, and that only its thread may release.
+    """A mutex that its holder, a thread, may acquire again, and that only its holder may release.
 
-    ``release`` raises AssertionError in any other.
+    In any other thread ``release`` raises AssertionError.
     """
 
     def __init__(self, *, ctx: Any = None) -> None:
@@ -171,26 +171,26 @@ class RLock(SemLock):
 
 if TYPE_CHECKING:
     LockLike: TypeAlias = SemLock | mp_synchronize.SemLock
-    """A lock: the types of ``Value`` are multiprocessing's, and so is that of its lock."""
+    """Type of a lock: Fiber's, or multiprocessing's, which the types of ``Value`` mention."""
 
 
 class Condition:
-    """A lock, and threads of any process that wait until others, who have it, notify them.
+    """A lock, and threads of any process that wait until a holder of the lock notifies them.
 
-    Who is killed while it waits is passed over; in multiprocessing ``notify`` waits for it.
+    ``notify`` passes over a waiter that was killed.  In multiprocessing it waits for the waiter.
     """
 
     def __init__(self, lock: LockLike | None = None, *, ctx: Any = None) -> None:
-        # A lock of multiprocessing's own has what is used here, too.
+        # multiprocessing's locks have the methods that are used here, too.
         self._lock = RLock() if lock is None else cast(SemLock, lock)
         self._waiters: AnyWaitList = wait_lists.create()
 
     def acquire(self, block: bool = True, timeout: float | None = None) -> bool:
-        """Acquire its lock."""
+        """Acquire the lock."""
         return self._lock.acquire(block, timeout)
 
     def release(self) -> None:
-        """Release its lock."""
+        """Release the lock."""
         self._lock.release()
 
     def __enter__(self) -> bool:
@@ -205,9 +205,9 @@ class Condition:
         self._lock.__exit__(kind, error, trace)
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Release the lock until notified; False when ``timeout`` seconds are over before."""
+        """Release the lock until notified; return False after ``timeout`` seconds."""
         self._check("wait")
-        waiters: Any = self._waiters  # a place is its own affair
+        waiters: Any = self._waiters  # the type of a place is private to the wait list
         depth = self._lock._semlock._count()
         place = waiters.enter()
         for _ in range(depth):
@@ -223,7 +223,7 @@ class Condition:
         return bool(notified)
 
     def wait_for(self, predicate: Callable[[], _T], timeout: float | None = None) -> _T:
-        """Wait until ``predicate`` is true; what it says when ``timeout`` seconds are over."""
+        """Wait until ``predicate`` is true; return its last value after ``timeout`` seconds."""
         deadline = None if timeout is None else time.monotonic() + timeout
         while not (result := predicate()):
             left = None if deadline is None else deadline - time.monotonic()
@@ -233,12 +233,12 @@ class Condition:
         return result
 
     def notify(self, n: int = 1) -> None:
-        """Wake ``n`` of those who wait, the first to come first."""
+        """Wake ``n`` waiters, those that have waited longest first."""
         self._check("notify")
         self._waiters.notify(max(0, n))
 
     def notify_all(self) -> None:
-        """Wake all who wait."""
+        """Wake all waiters."""
         self._check("notify")
         self._waiters.notify(SEM_VALUE_MAX)
 
@@ -252,8 +252,8 @@ class Condition:
 class Barrier(threading.Barrier):
     """A point at which ``parties`` threads of any process wait for each other.
 
-    When a process that has taken part is killed, the barrier is broken for those who wait, or will,
-    within a second or two; in multiprocessing they wait for ever.
+    If a process that has taken part is killed, the barrier breaks within a second or two, for
+    present and later waiters.  In multiprocessing they wait for ever.
     """
 
     def __init__(
@@ -278,7 +278,7 @@ class Barrier(threading.Barrier):
     ) -> None:
         self._parties, self._action, self._timeout = parties, action, timeout
         self._cond = condition
-        # Processes that took part, and how many of their threads are counted; with the lock.
+        # Processes that took part, and their counted threads.  The lock guards both.
         self._members: Any = members
         self._membership: Any = None
         self._member = 0
@@ -289,9 +289,9 @@ class Barrier(threading.Barrier):
         return _rebuild_barrier, (type(self), parts)
 
     def wait(self, timeout: float | None = None) -> int:
-        """Wait for the others; a number from 0 to ``parties`` - 1, another for each."""
+        """Wait for the others; return a different number from 0 to ``parties`` - 1 to each."""
         with self._cond as acquired:
-            if isinstance(acquired, Abandoned):  # in the middle of this very method
+            if isinstance(acquired, Abandoned):  # its process died in this method
                 self._bury()
                 self._break()
             self._join()
@@ -309,16 +309,16 @@ class Barrier(threading.Barrier):
         return index
 
     def reset(self) -> None:
-        """Return to the initial state; those that wait get BrokenBarrierError."""
+        """Return to the initial state; waiters get BrokenBarrierError."""
         with self._cond:
             self._bury()
         super().reset()
 
     def _join(self) -> None:
-        if self._member != os.getpid():  # a process that was forked is another one
+        if self._member != os.getpid():  # a forked process is another member
             self._member, self._counted = os.getpid(), 0
             self._membership = self._members.enter()
-            # Who ends in good order is not missed.
+            # A process that ends normally breaks no barrier.
             weakref.finalize(self, self._members.dismiss, self._membership)
 
     def _change_count(self, by: int) -> None:
@@ -356,7 +356,7 @@ class Barrier(threading.Barrier):
             self._members.set(1, self._members.held())
         return bool(died)
 
-    # What threading's class keeps, in shared memory
+    # Attributes of threading's class, in shared memory
 
     @property
     def _state(self) -> int:
@@ -371,7 +371,7 @@ class Barrier(threading.Barrier):
         count: int = self._members.get(1)
         return count
 
-    if TYPE_CHECKING:  # threading's own, of which its stub does not tell
+    if TYPE_CHECKING:  # methods of threading's class that its stub lacks
 
         def _break(self) -> None: ...
         def _release(self) -> None: ...
@@ -390,13 +390,13 @@ def _rebuild_barrier(cls: type[Barrier], parts: tuple[Any, ...]) -> Barrier:
 class Event:
     """A flag to wait for.
 
-    Who waits is woken by ``set`` even if ``clear`` follows at once; ``wait`` says True then, as in
+    ``set`` wakes all waiters even if ``clear`` follows at once.  ``wait`` then returns True, as in
     ``threading``.
     """
 
     def __init__(self, *, ctx: Any = None) -> None:
         self._flag: SharedCounter = LocalCounter.create()
-        # Counts the calls of ``set``: whoever finds it changed was woken, whatever the flag says.
+        # Number of calls of ``set``.  A waiter that finds it changed was woken, set or not.
         self._bell: SharedCounter = LocalCounter.create()
 
     def is_set(self) -> bool:
@@ -404,7 +404,7 @@ class Event:
         return self._flag.wait(0)
 
     def set(self) -> None:
-        """Set the flag and wake all who wait."""
+        """Set the flag and wake all waiters."""
         if not self._flag.wait(0):
             self._flag.add(1)
         self._bell.add(1)
@@ -414,7 +414,7 @@ class Event:
         self._flag.clear()
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Wait until the flag is set; False when ``timeout`` seconds are over."""
+        """Wait until the flag is set; return False after ``timeout`` seconds."""
         if self._flag.wait(0):
             return True
         rung = self._bell.value()

@@ -335,7 +335,7 @@ def test_too_much_is_an_error_that_lists_the_largest_and_says_what_to_do(
     largest = [f"{folder}/{name}" for name in ("data/", "model.bin", "main.py")]
     assert list(caught.value.largest) == largest
     said = str(caught.value)
-    assert "it has 5.0 MiB, and what is sent is at most 3.0 MiB" in said
+    assert "it has 5.0 MiB, and at most 3.0 MiB are sent" in said
     assert f"3.0 MiB  {folder}/data/" in said
     assert f"{folder}/.fiberignore" in said
     (folder / ".fiberignore").write_text("model.bin\ndata/\n")

@@ -194,7 +194,7 @@ def return_unreadable(rank: int, size: int) -> Any:
 def test_a_result_that_cannot_be_unpickled() -> None:
     with pytest.raises(ValueError, match="no number") as caught:
         fiber.Ring(2, return_unreadable).run()
-    assert caught.value.__notes__ == ["what member 1 of the ring returned cannot be unpickled"]
+    assert caught.value.__notes__ == ["the result of member 1 of the ring cannot be unpickled here"]
 
 
 def raise_a_lock(rank: int, size: int) -> None:
