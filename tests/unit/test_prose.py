@@ -24,6 +24,7 @@ VAGUE = re.compile(r"\b(whoever|whatever)\b", re.IGNORECASE)
 MOST_VAGUE = 100
 MOST_WORDS_OF_A_CELL = 40
 CELL_BORDER = re.compile(r"(?<!\\)\|")
+NAMED_CLASS = re.compile(r"\b[A-Z][a-z]+(?:[A-Z][a-z]+)+\b")
 NAMED_MODULE = re.compile(r"`([\w/.-]*\w\.py)(?:::\w+)?`")
 
 RECORDS = sorted((ROOT / "docs" / "decisions").glob("[0-9]*.md"))
@@ -101,6 +102,20 @@ def test_named_modules_exist() -> None:
         for place, line in lines_of(page)
         for name in NAMED_MODULE.findall(line)
         if not any(module.endswith(f"/{name}") for module in modules)
+    ]
+    assert not found, "\n".join(found)
+
+
+def test_named_classes_exist() -> None:
+    sources = "".join(
+        path.read_text(encoding="utf-8")
+        for path in tracked("sdk/*.py", "operator/*.py", "crds/*.py")
+    )
+    found = [
+        f"{place}: {name}"
+        for place, line in lines_of(ROOT / "docs" / "architecture.md")
+        for name in NAMED_CLASS.findall(line)
+        if not re.search(rf"\b{name}\b", sources)
     ]
     assert not found, "\n".join(found)
 
