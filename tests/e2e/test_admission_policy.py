@@ -106,7 +106,10 @@ def test_what_a_template_may_ask_for(guarded: Scene, agent: Body) -> None:
     more = {
         "hostNetwork": False,
         "serviceAccountName": "default",
-        "volumes": [{"name": "tmp", "emptyDir": {}}],
+        "volumes": [
+            {"name": "tmp", "emptyDir": {}},
+            {"name": "anothers", "secret": {"secretName": "warm-fiber-key"}},
+        ],
         "initContainers": [{"name": "first", "image": "x", "securityContext": context}],
     }
     pool = Pool(guarded, "es")

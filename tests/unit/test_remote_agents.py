@@ -60,6 +60,14 @@ def test_the_end_of_a_child_names_the_host_of_its_link() -> None:
     assert (report.host, report.pod, report.node) == ("far", "es-1", "node-2")
 
 
+def test_a_child_whose_end_is_not_reported_ends_with_the_link_of_its_agent() -> None:
+    agent, (observer,) = agent_with_children("far", 1)
+    agent.on_frame(bytearray(messages.Started(1, 1).encode()))
+    assert observer.report is None, "no word of its agent, so join() waits"
+    agent.on_lost("the pod was deleted")
+    assert observer.report is not None
+
+
 class Large(ReadLink):
     """A link on which blobs and starts are large: they leave when the test says so."""
 

@@ -23,6 +23,14 @@ def sealed(sealer: Sealer, data: bytes) -> bytes:
     return bytes(target)
 
 
+@pytest.mark.parametrize("size", [0, 1, 1000])
+def test_a_sealed_message_shows_its_size_alone(size: int) -> None:
+    sealer = Sealer(SECRET)
+    first, second = sealed(sealer, bytes(size)), sealed(sealer, bytes(size))
+    assert len(first) == len(second) == size + OVERHEAD
+    assert first != second
+
+
 @given(st.lists(st.binary(max_size=300), max_size=30), st.integers(1, 5), st.integers(300, 1000))
 def test_messages_open_in_order_whenever_the_key_changes(
     messages: list[bytes], per_key: int, bytes_per_key: int
