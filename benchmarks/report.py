@@ -197,10 +197,9 @@ def reading(run: Run, cases: Sequence[Case]) -> str:
     ]
     baselines = " or ".join(dict.fromkeys(BY_NAME[name].label for name in measured))
     text = (
-        f"Median of {rounds} round{'s' if rounds > 1 else ''}; contenders with servers of their "
-        f"own take part in at most {SERVER_ROUNDS}, cases with {MANY:,} workers and more are "
-        f"measured in at most {MANY_ROUNDS}, and what else takes more than {LONG:g} s is measured "
-        "once."
+        f"Median of {rounds} round{'s' if rounds > 1 else ''}. Contenders with servers take part "
+        f"in at most {SERVER_ROUNDS}. Cases with {MANY:,} workers and more are measured in at most "
+        f"{MANY_ROUNDS} rounds, and other cases that take more than {LONG:g} s in one."
     )
     if baselines:
         text += f" The ratio is to {baselines} in the same round: its median, least and greatest."
@@ -208,7 +207,7 @@ def reading(run: Run, cases: Sequence[Case]) -> str:
         text += f"\n\n{_company(run.in_use)}"
     if run.about["size"] < 1:
         size = f"{run.about['size']:g}"
-        text += f"\n\n**Run at {size} of the full size: it shows that everything works, no more.**"
+        text += f"\n\n**Run at {size} of the full size, which only shows that everything works.**"
     return text
 
 
@@ -217,9 +216,9 @@ def _company(in_use: Sequence[float]) -> str:
     verdict = (
         "the machine was idle."
         if is_idle(in_use)
-        else "**the machine was not idle**, which shows in short times above all."
+        else "**the machine was not idle**, which affects short times most."
     )
-    return f"Of the processors' time others used {shares} in a moment before each round: {verdict}"
+    return f"Before each round others used {shares} of the processors' time: {verdict}"
 
 
 def failures(run: Run) -> str:
@@ -236,7 +235,7 @@ def failures(run: Run) -> str:
     if not rows and not skipped:
         return ""
     rows += [(case, contender, why) for contender, case, why in skipped]
-    return "## Not measured\n\n" + table(("case", "contender", "why"), rows)
+    return "## Not measured\n\n" + table(("case", "contender", "reason"), rows)
 
 
 def _skipped(run: Run) -> list[tuple[str, str]]:

@@ -82,8 +82,8 @@ def test_each_measure_looks_at_the_machine_before_each_of_its_rounds(tmp_path: P
 @pytest.mark.parametrize(
     ("in_use", "words"),
     [
-        ([0.004, 0.02], "others used 0 %, 2 % in a moment before each round: the machine was idle"),
-        ([0.0, 0.31], "others used 0 %, 31 % in a moment before each round: **the machine was not"),
+        ([0.004, 0.02], "others used 0 %, 2 % of the processors' time: the machine was idle"),
+        ([0.0, 0.31], "others used 0 %, 31 % of the processors' time: **the machine was not"),
     ],
 )
 def test_the_page_says_whether_the_machine_was_idle(in_use: list[float], words: str) -> None:
