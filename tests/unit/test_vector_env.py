@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import sys
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
@@ -162,6 +164,15 @@ def test_bad_options(wrong: dict[str, Any], error: type[Exception]) -> None:
         VectorEnv([Faulty], **wrong)
     with pytest.raises(ValueError, match="env_fns is empty"):
         VectorEnv([])
+
+
+def test_a_wrong_keyword_shows_one_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[Any] = []
+    monkeypatch.setattr(sys, "unraisablehook", shown.append)
+    with pytest.raises(TypeError, match="unexpected keyword argument 'workers'"):
+        VectorEnv([Faulty], workers=2)  # type: ignore[call-arg]
+    gc.collect()
+    assert shown == []
 
 
 def test_an_environment_that_cannot_be_made_or_pickled() -> None:

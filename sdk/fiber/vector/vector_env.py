@@ -274,7 +274,8 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
         self._sub_environments.close(0 if terminate else timeout)
 
     def __del__(self) -> None:
-        if not getattr(self, "closed", True):
+        # Without them, ``__init__`` has raised.
+        if not self.closed and hasattr(self, "_sub_environments"):
             self._sub_environments.discard()
 
     # What they have in common
