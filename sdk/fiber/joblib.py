@@ -27,8 +27,8 @@ from inspect import signature
 from typing import Any
 
 from fiber import cpu
-from fiber._hub import shared_buffer
-from fiber._hub.shared_buffer import SharedBuffer
+from fiber._hub import shared_blocks
+from fiber._hub.shared_blocks import SharedBuffer
 from fiber._installation import explained_if_missing
 from fiber._runtime.state import runtime
 from fiber.futures import Executor
@@ -287,7 +287,7 @@ class MemmappedArguments:
             self._sent[number] = weakref.ref(array, lambda _: self._forget(number))
         if not (again or self._mode in ("r+", "w+")) or len(self._shared) >= _SHARED_ARRAYS:
             return None
-        buffer = shared_buffer.allocate(array.nbytes)
+        buffer = shared_blocks.create_buffer(array.nbytes)
         order = "F" if array.flags.fnc else "C"
         _array(buffer, array.dtype, array.shape, order, "w+")[...] = array
         return self._shared.setdefault(number, buffer)

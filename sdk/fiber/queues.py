@@ -27,10 +27,9 @@ from queue import Empty, Full
 from typing import Any, Generic, TypeVar
 
 from fiber import reduction
-from fiber._hub import one_way
-from fiber._hub.dealer import Dealer, arrive
-from fiber._hub.feeder import Feeder, ItemCount, Slots
+from fiber._hub import local
 from fiber._hub.local import LocalChannel, LocalCounter
+from fiber._hub.queue_delivery import Dealer, Feeder, ItemCount, QueueSlots, arrive
 from fiber._transport.channels import SharedCounter
 from fiber._wire import packet
 from fiber._wire.packet import Message
@@ -47,8 +46,8 @@ class Queue(Generic[_T]):
     """A first-in first-out queue for any number of processes and threads."""
 
     def __init__(self, maxsize: int = 0, *, ctx: Any = None) -> None:
-        self._slots: Slots | ItemCount = (
-            ItemCount() if maxsize <= 0 else Slots(operator.index(maxsize))
+        self._slots: QueueSlots | ItemCount = (
+            ItemCount() if maxsize <= 0 else QueueSlots(operator.index(maxsize))
         )
         self._inbox, self._outbox = LocalChannel.pair()
         self._open()
@@ -228,7 +227,7 @@ class SimpleQueue(Generic[_T]):
     """A queue whose ``put`` waits until the item is in the pipe."""
 
     def __init__(self, *, ctx: Any = None) -> None:
-        inbox, outbox = one_way.pair()
+        inbox, outbox = local.one_way_pair()
         self._reader = Connection(inbox, writable=False)
         self._writer = Connection(outbox, readable=False)
 
@@ -279,7 +278,7 @@ class SimpleQueuePush(Generic[_T]):
     _reader: Connection | None
 
     def __init__(self, *, ctx: Any = None) -> None:
-        inbox, outbox = one_way.pair()
+        inbox, outbox = local.one_way_pair()
         arrivals, registration = LocalChannel.pair()
         Dealer(inbox, arrivals).start()
         self.__setstate__((Connection(outbox, readable=False), registration))

@@ -21,8 +21,8 @@ from multiprocessing.sharedctypes import (
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar, overload
 
 from fiber import synchronize
-from fiber._hub import shared_buffer
-from fiber._hub.shared_buffer import SharedBuffer
+from fiber._hub import shared_blocks
+from fiber._hub.shared_blocks import SharedBuffer
 
 if TYPE_CHECKING:
     from _ctypes import _CData
@@ -244,7 +244,7 @@ def _type(typecode_or_type: Any) -> Any:
 
 
 def _new(type_: Any) -> Any:
-    return _placed(type_, shared_buffer.allocate(ctypes.sizeof(type_)))
+    return _placed(type_, shared_blocks.create_buffer(ctypes.sizeof(type_)))
 
 
 def _placed(type_: Any, buffer: SharedBuffer) -> Any:

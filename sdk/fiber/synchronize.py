@@ -20,7 +20,7 @@ from collections.abc import Callable
 from multiprocessing import current_process
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar, cast
 
-from fiber._hub import shared_semaphores, wait_lists
+from fiber._hub import shared_blocks
 from fiber._hub.local import LocalCounter
 from fiber._sync.semaphore import COUNTING, RECURSIVE, SEM_VALUE_MAX, Abandoned
 
@@ -28,8 +28,7 @@ if TYPE_CHECKING:
     from multiprocessing import synchronize as mp_synchronize
     from types import TracebackType
 
-    from fiber._hub.shared_semaphores import AnySemaphore
-    from fiber._hub.wait_lists import AnyWaitList
+    from fiber._hub.shared_blocks import AnySemaphore, AnyWaitList
     from fiber._transport.channels import SharedCounter
 
 __all__ = [
@@ -59,7 +58,7 @@ class SemLock:
     """
 
     def __init__(self, kind: int, value: int, maximum: int) -> None:
-        self._semlock: AnySemaphore = shared_semaphores.create(kind, value, maximum)
+        self._semlock: AnySemaphore = shared_blocks.create_semaphore(kind, value, maximum)
 
     def acquire(self, block: bool = True, timeout: float | None = None) -> bool:
         """Take a token; return False if none becomes free within ``timeout`` seconds."""
@@ -183,7 +182,7 @@ class Condition:
     def __init__(self, lock: LockLike | None = None, *, ctx: Any = None) -> None:
         # multiprocessing's locks have the methods that are used here, too.
         self._lock = RLock() if lock is None else cast(SemLock, lock)
-        self._waiters: AnyWaitList = wait_lists.create()
+        self._waiters: AnyWaitList = shared_blocks.create_wait_list()
 
     def acquire(self, block: bool = True, timeout: float | None = None) -> bool:
         """Acquire the lock."""
@@ -266,7 +265,7 @@ class Barrier(threading.Barrier):
     ) -> None:
         if parties < 1:
             raise ValueError(f"a barrier is for at least one party, not {parties}")
-        self._set_up(parties, action, timeout, Condition(), wait_lists.create())
+        self._set_up(parties, action, timeout, Condition(), shared_blocks.create_wait_list())
 
     def _set_up(
         self,

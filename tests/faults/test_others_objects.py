@@ -11,7 +11,7 @@ import pytest
 
 import fiber
 from faults.runtime import running
-from fiber._hub.client import HubStream, Unreachable
+from fiber._hub.client import HubStream, ObjectUnreachable
 from fiber._hub.protocol import GRANTING, NO_SECRET, SECRETS, Op
 from patience import PATIENCE
 
@@ -45,7 +45,7 @@ def break_in(mine: Any) -> tuple[int, list[bytes]]:
             try:
                 stream._send(form.pack(*say))
                 found += map(bytes, stream.ask(Op.TRY_RECV).parts)
-            except Unreachable:
+            except ObjectUnreachable:
                 refused += 1
             finally:
                 stream.close()

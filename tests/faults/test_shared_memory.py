@@ -15,7 +15,7 @@ from faults.program import wait_for
 from faults.runtime import running
 from fiber._backends.loopback import LoopbackBackend
 from fiber._hub import client
-from fiber._hub.client import Unreachable
+from fiber._hub.client import ObjectUnreachable
 from fiber.managers import SharedMemoryManager
 from patience import PATIENCE
 
@@ -63,7 +63,7 @@ def test_the_home_of_an_array_is_gone(agents: LoopbackBackend) -> None:
     child.join(PATIENCE)
     array[0] += 10
     assert list(array) == [11, 2, 3]
-    with pytest.raises(Unreachable, match="loopback-0"):
+    with pytest.raises(ObjectUnreachable, match="loopback-0"):
         hears.send(array)
 
 

@@ -18,10 +18,10 @@ from census import wait_until
 from fiber import reduction
 from fiber._agent.worker import Worker
 from fiber._hub.client import HubStream
-from fiber._hub.dealer import arrive
 from fiber._hub.handles import GrantSet, collecting_grants
 from fiber._hub.local import LocalChannel
 from fiber._hub.protocol import Op
+from fiber._hub.queue_delivery import arrive
 from fiber._wire import packet, work
 from fiber.connection import Connection
 from hosts import Hosts, Wire, background

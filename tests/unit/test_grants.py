@@ -14,7 +14,7 @@ import pytest
 import fiber
 from census import wait_until
 from fiber._hub import protocol
-from fiber._hub.client import HubStream, Unreachable
+from fiber._hub.client import HubStream, ObjectUnreachable
 from fiber._hub.handles import HubHandle, handle_for
 from fiber._hub.protocol import (
     GRANTING,
@@ -55,7 +55,7 @@ def others(home: HubAddress, far: Far) -> Iterator[RemoteChannel]:
 
 
 def refused(stream: HubStream) -> None:
-    with pytest.raises(Unreachable, match="not there any more"):
+    with pytest.raises(ObjectUnreachable, match="not there any more"):
         stream.ask(Op.SYNC, 0, form=ONE)
 
 
@@ -79,7 +79,7 @@ def test_what_others_have_cannot_be_passed_on(
     others: RemoteChannel, stream: HubStream, guess: bytes | str
 ) -> None:
     tried = others.identity if isinstance(guess, str) else guess
-    with pytest.raises(Unreachable, match="not there any more"):
+    with pytest.raises(ObjectUnreachable, match="not there any more"):
         stream.ask(Op.GRANT, 0, tried, form=GRANTING)
 
 
@@ -87,7 +87,7 @@ def test_a_descriptor_takes_a_grant(hosts: Hosts, others: RemoteChannel, home: H
     for tried in (NO_SECRET, others.identity, others.token):
         with hosts.child_at("a"):
             stream = HubStream(home)
-            with pytest.raises(Unreachable, match="not there any more"):
+            with pytest.raises(ObjectUnreachable, match="not there any more"):
                 stream.ask(Op.FETCH, tried, form=SECRET)
             stream.close()
 
@@ -110,7 +110,7 @@ def knows(home: HubAddress, token: bytes) -> bool:
     try:
         stream._send(SECRETS.pack(Op.ATTACH, 1, token, NO_SECRET))
         stream.ask(Op.SYNC, 0, form=ONE)
-    except Unreachable:
+    except ObjectUnreachable:
         return False
     finally:
         stream.close()
@@ -127,7 +127,7 @@ def test_a_token_stands_for_one_object(far: Far, home: HubAddress, hosts: Hosts)
     assert isinstance(handle, HubHandle)
     stream = HubStream(home)
     stream._send(SECRETS.pack(Op.ATTACH, 1, used._channel.token, handle.grant))
-    with pytest.raises(Unreachable, match="already in use"):
+    with pytest.raises(ObjectUnreachable, match="already in use"):
         stream.ask(Op.SYNC, 0, form=ONE)
     stream.close()
 

@@ -19,7 +19,7 @@ import fiber
 from census import wait_until
 from fiber import reduction
 from fiber._hub import client, handles, protocol
-from fiber._hub.client import HubStream, NoHub, Unreachable
+from fiber._hub.client import HubStream, NoHub, ObjectUnreachable
 from fiber._hub.handles import collecting_grants
 from fiber._hub.protocol import NO_SECRET, SECRET, HubAddress, Op
 from fiber._wire import packet
@@ -57,7 +57,7 @@ def test_a_handle_works_once(hosts: Hosts) -> None:
         assert objects_kept(hub) == 1
         pickle.loads(data)
         assert objects_kept(hub) == 0
-        with pytest.raises(Unreachable, match="used once already"):
+        with pytest.raises(ObjectUnreachable, match="used once already"):
             pickle.loads(data)
 
 
@@ -73,7 +73,7 @@ def test_collected_handles_work_until_released(hosts: Hosts) -> None:
         collected.release()
         assert not collected
         assert objects_kept(hub) == 0
-        with pytest.raises(Unreachable):
+        with pytest.raises(ObjectUnreachable):
             pickle.loads(data)
 
 
@@ -284,7 +284,7 @@ def test_a_wrong_key_is_refused_with_a_reason(hosts: Hosts) -> None:
     own = hosts["a"].address
     with hosts.child_at("a"):
         stream = HubStream(HubAddress("a", own.path, bytes(32)))
-        with pytest.raises(Unreachable, match="another program"):
+        with pytest.raises(ObjectUnreachable, match="another program"):
             stream.ask(Op.FETCH, NO_SECRET, form=SECRET)
         stream.close()
 
@@ -305,7 +305,7 @@ def test_a_hub_that_is_gone_is_named(hosts: Hosts) -> None:
         assert hub.directory is not None
         directory = hub.directory
         assert wait_until(lambda: not os.path.exists(directory), PATIENCE)
-        with pytest.raises(Unreachable, match="host 'a'"):
+        with pytest.raises(ObjectUnreachable, match="host 'a'"):
             pickle.loads(data)
 
 

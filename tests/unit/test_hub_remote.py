@@ -17,11 +17,11 @@ import pytest
 
 import fiber
 from census import wait_until
-from fiber._hub.client import HubStream, Unreachable
+from fiber._hub.client import HubStream, ObjectUnreachable
 from fiber._hub.handles import collecting_grants
 from fiber._hub.local import LocalChannel, LocalCounter
 from fiber._hub.remote import RemoteChannel, RemoteCounter
-from fiber._hub.tunnel import WINDOW
+from fiber._hub.streams import WINDOW
 from fiber.connection import Connection
 from fiber.errors import ConnectionClosed
 from hosts import Far, Hosts, background, objects_kept
@@ -245,7 +245,7 @@ def test_a_handle_used_twice_says_so(hosts: Hosts, far: Far) -> None:
     pickle.loads(data).close()
     assert wait_until(lambda: objects_kept(hosts["a"]) == 0, PATIENCE)
     late = pickle.loads(data)
-    with pytest.raises(Unreachable, match="used once already"):
+    with pytest.raises(ObjectUnreachable, match="used once already"):
         late.poll()
     with pytest.raises(BrokenPipeError, match="used once already"):
         late.send(1)

@@ -18,7 +18,7 @@ import pytest
 import fiber
 from census import wait_until
 from fiber._hub import client
-from fiber._hub.client import Unreachable
+from fiber._hub.client import ObjectUnreachable
 from fiber._hub.local import LocalCounter
 from fiber._hub.protocol import HubAddress
 from fiber.connection import Connection
@@ -170,7 +170,7 @@ def test_a_lost_link_ends_every_wait_with_its_reason(hosts: Hosts, far: Far) -> 
     def fails(wait_for_it: Callable[..., Any], *args: Any) -> None:
         try:
             wait_for_it(*args)
-        except Unreachable as error:
+        except ObjectUnreachable as error:
             errors.append(str(error))
 
     remote.poll(0)
@@ -199,7 +199,7 @@ def test_a_host_that_nobody_knows_is_named(hosts: Hosts) -> None:
         data = pickle.dumps(there)
     with hosts.at("b"):
         remote = pickle.loads(data)
-        with pytest.raises(Unreachable, match="'elsewhere' cannot be reached"):
+        with pytest.raises(ObjectUnreachable, match="'elsewhere' cannot be reached"):
             remote.poll()
         remote.close()
     here.close()
@@ -312,7 +312,7 @@ def test_a_queue_whose_host_is_gone_holds_nobody(hosts: Hosts, far: Far) -> None
     assert queue.get(timeout=PATIENCE) == 1
     hosts.on_loop(hosts["b"].unlink, "a", "agent a was lost")
     remote.put(2)
-    with pytest.raises(Unreachable, match="agent a was lost"):
+    with pytest.raises(ObjectUnreachable, match="agent a was lost"):
         remote.get()
     remote.close()
     remote.join_thread()

@@ -13,10 +13,9 @@ from hypothesis import strategies as st
 
 import fiber
 from census import wait_until
-from fiber._hub.client import Unreachable
+from fiber._hub.client import ObjectUnreachable
 from fiber._hub.remote import RemoteChannel
-from fiber._hub.streams import NullHandler
-from fiber._hub.tunnel import WINDOW, Frame, Tunnels, TunnelStream
+from fiber._hub.streams import WINDOW, NullHandler, TunnelFrame, Tunnels, TunnelStream
 from fiber._wire import messages
 from fiber._wire.messages import TunnelClose, TunnelData, TunnelOpen
 from fiber._wire.packet import Message
@@ -54,7 +53,7 @@ class Pair:
 
     @staticmethod
     def _sender(queue: list[bytes]) -> Any:
-        def send(frame: Frame) -> None:
+        def send(frame: TunnelFrame) -> None:
             queue.append(frame.encode())
 
         return send
@@ -288,7 +287,7 @@ def test_an_agent_that_is_lost_is_named_to_the_others(agents: Hosts) -> None:
         here.send(1)
         assert remote.recv() == 1
         agents.on_loop(agents["master"].unlink, "one", "agent one was lost")
-        with pytest.raises(Unreachable, match="agent one was lost"):
+        with pytest.raises(ObjectUnreachable, match="agent one was lost"):
             remote.poll(None)
         remote.close()
 
@@ -324,6 +323,6 @@ def test_a_host_that_the_master_does_not_know_is_named(agents: Hosts) -> None:
         data = pickle.dumps(there)
     with agents.at("two"):
         remote = pickle.loads(data)
-        with pytest.raises(Unreachable, match="'nobody' cannot be reached"):
+        with pytest.raises(ObjectUnreachable, match="'nobody' cannot be reached"):
             remote.poll()
         remote.close()

@@ -24,8 +24,8 @@ import pytest
 import fiber
 from fiber import queues, reduction
 from fiber._agent.agent import Agent
-from fiber._hub import feeder, handles, hub, registry, remote
-from fiber._hub.client import HubStream, Unreachable
+from fiber._hub import handles, hub, queue_delivery, registry, remote
+from fiber._hub.client import HubStream, ObjectUnreachable
 from fiber._hub.handles import GrantSet
 from fiber._hub.local import LocalChannel, QuietSocket
 from fiber._hub.protocol import NO_SECRET, ONE, SECRET, Op
@@ -83,7 +83,7 @@ def test_a_put_within_a_put_of_the_same_queue(monkeypatch: pytest.MonkeyPatch) -
 @pytest.mark.slow
 @pytest.mark.parametrize("before", [0, MORE_THAN_FITS], ids=["direct", "fed"])
 def test_ctrl_c_at_any_line_of_a_put_leaves_a_queue_that_works(before: int) -> None:
-    files = {queues.__file__, feeder.__file__}
+    files = {queues.__file__, queue_delivery.__file__}
 
     def put_and_drain(stop: int) -> bool:
         """Whether the put was interrupted, at its step number ``stop``."""
@@ -112,8 +112,8 @@ def test_ctrl_c_at_any_step_of_a_put_costs_no_place_and_no_join(
 ) -> None:
     if fed:
         monkeypatch.setattr(LocalChannel, "can_try_send", False)
-        monkeypatch.setattr(feeder.Feeder, "_start_thread", lambda _: None)
-    files = {queues.__file__, feeder.__file__, channels.__file__}
+        monkeypatch.setattr(queue_delivery.Feeder, "_start_thread", lambda _: None)
+    files = {queues.__file__, queue_delivery.__file__, channels.__file__}
 
     def put(stop: int) -> bool:
         """Whether the put was interrupted, at its step number ``stop``."""
@@ -237,7 +237,7 @@ def test_who_waits_for_a_hub_that_ends_is_told(
             call_soon(hub_a.close)
 
         monkeypatch.setattr(hosts.loop, "call_soon", ends_first)
-        with pytest.raises(Unreachable, match="has ended"):
+        with pytest.raises(ObjectUnreachable, match="has ended"):
             pickle.loads(data)
         here.close()
 

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 import fiber
-from fiber._hub import shared_semaphores
+from fiber._hub import shared_blocks
 from fiber._sync import semaphore as module
 from fiber._sync.semaphore import COUNTING, RECURSIVE, SEM_VALUE_MAX, SharedSemaphore
 from fiber.synchronize import Abandoned
@@ -30,7 +30,7 @@ KINDS = {"mutex": (COUNTING, 1), "recursive": (RECURSIVE, 1), "counting": (COUNT
 @pytest.fixture(params=KINDS.values(), ids=KINDS.keys())
 def one(request: pytest.FixtureRequest) -> SharedSemaphore:
     kind, maximum = request.param
-    return shared_semaphores.create(kind, 1, maximum)
+    return shared_blocks.create_semaphore(kind, 1, maximum)
 
 
 def take_turn(semaphore: SharedSemaphore) -> None:
@@ -197,7 +197,7 @@ def test_a_dead_reviver_is_followed_by_another(
 
 
 def test_all_that_it_had_is_released() -> None:
-    semaphore = shared_semaphores.create(COUNTING, 3, 3)
+    semaphore = shared_blocks.create_semaphore(COUNTING, 3, 3)
     in_fork(lambda: [semaphore.acquire() for _ in range(3)])
     with pytest.warns(RuntimeWarning, match="ended"):
         assert semaphore.acquire(timeout=PATIENCE)
@@ -205,7 +205,7 @@ def test_all_that_it_had_is_released() -> None:
 
 
 def test_what_the_living_hold_is_not() -> None:
-    semaphore = shared_semaphores.create(COUNTING, 2, 2)
+    semaphore = shared_blocks.create_semaphore(COUNTING, 2, 2)
     semaphore.acquire()
     in_fork(semaphore.acquire)
     with pytest.warns(RuntimeWarning, match="ended"):
@@ -214,7 +214,7 @@ def test_what_the_living_hold_is_not() -> None:
 
 
 def test_a_semaphore_that_carries_signals_is_not_revived() -> None:
-    semaphore = shared_semaphores.create(COUNTING, 1, SEM_VALUE_MAX)
+    semaphore = shared_blocks.create_semaphore(COUNTING, 1, SEM_VALUE_MAX)
     in_fork(semaphore.acquire)
     semaphore.release()  # what another one acquired
     assert semaphore.acquire() is True
@@ -222,7 +222,7 @@ def test_a_semaphore_that_carries_signals_is_not_revived() -> None:
 
 
 def test_more_tokens_than_can_be_told_apart() -> None:
-    semaphore = shared_semaphores.create(COUNTING, 1000, SEM_VALUE_MAX)
+    semaphore = shared_blocks.create_semaphore(COUNTING, 1000, SEM_VALUE_MAX)
     assert all(semaphore.acquire(False) is True for _ in range(1000))
     assert not semaphore.acquire(False)
     for _ in range(1000):
@@ -231,14 +231,14 @@ def test_more_tokens_than_can_be_told_apart() -> None:
 
 
 def test_signals_are_consumed_without_end() -> None:
-    semaphore = shared_semaphores.create(COUNTING, 0, SEM_VALUE_MAX)
+    semaphore = shared_blocks.create_semaphore(COUNTING, 0, SEM_VALUE_MAX)
     in_fork(lambda: [semaphore.release() for _ in range(2000)])
     assert all(semaphore.acquire(False) for _ in range(2000))
     assert len(semaphore._held) < 1000
 
 
 def test_the_slots_of_the_dead_are_used_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    semaphore = shared_semaphores.create(COUNTING, 1, 1)
+    semaphore = shared_blocks.create_semaphore(COUNTING, 1, 1)
     for _ in range(len(module._SLOTS) // 64):
         in_fork(lambda: [semaphore._mutex.run(semaphore._claim) for _ in range(64)])
     in_fork(lambda: [semaphore._mutex.run(semaphore._claim) for _ in range(64)])

@@ -18,11 +18,10 @@ import pytest
 import fiber
 import fiber.connection
 from census import wait_until
-from fiber._hub import dealer, one_way
-from fiber._hub.dealer import Dealer
+from fiber._hub import local, queue_delivery
 from fiber._hub.hosted import HostedReceiver
-from fiber._hub.local import LocalChannel
-from fiber._hub.one_way import AMBIGUOUS, Receiver, Sender
+from fiber._hub.local import AMBIGUOUS, LocalChannel, ReceivingEnd, SendingEnd
+from fiber._hub.queue_delivery import Dealer
 from fiber._transport import channels
 from fiber._wire import packet
 from fiber.errors import ConnectionClosed
@@ -32,18 +31,18 @@ SIZES = (0, 1, 40, 100, 1000, 10_000, 60_000)
 MORE_THAN_A_SOCKET = 1000
 """Small messages that no socket holds."""
 
-Ends = tuple[Receiver, Sender]
+Ends = tuple[ReceivingEnd, SendingEnd]
 
 
 @pytest.fixture
 def ends() -> Iterator[Ends]:
-    receiver, sender = one_way.pair()
+    receiver, sender = local.one_way_pair()
     yield receiver, sender
     receiver.close()
     sender.close()
 
 
-def is_readable(channel: Receiver) -> bool:
+def is_readable(channel: ReceivingEnd) -> bool:
     """Return whether ``select`` and its like find the channel readable."""
     poller = select.poll()
     poller.register(channel.fileno(), select.POLLIN)
@@ -59,18 +58,18 @@ def test_a_pair_makes_each_socket_once(monkeypatch: pytest.MonkeyPatch) -> None:
             super().__init__(owner)
 
     monkeypatch.setattr(channels, "BorrowedSocket", Counted)
-    for end in one_way.pair():
+    for end in local.one_way_pair():
         end.close()
     assert len(made) == 2
 
 
-def overflow(sender: Sender, count: int = MORE_THAN_A_SOCKET) -> None:
+def overflow(sender: SendingEnd, count: int = MORE_THAN_A_SOCKET) -> None:
     for number in range(count):
         assert sender.try_send(b"%d" % number)
     assert sender.backlog
 
 
-def drain(receiver: Receiver) -> list[bytes]:
+def drain(receiver: ReceivingEnd) -> list[bytes]:
     taken = []
     while (message := receiver.try_recv()) is not None:
         taken.append(message.tobytes())
@@ -207,7 +206,7 @@ def test_every_receiver_that_sleeps_is_woken(ends: Ends) -> None:
     assert is_readable(receiver)
 
 
-def _received(receiver: Receiver) -> packet.Message | None:
+def _received(receiver: ReceivingEnd) -> packet.Message | None:
     """The next message of the socket alone; the wake-up packet stays there."""
     if receiver._peek() == bytes([packet.WAKE_UP]):
         return None
@@ -267,10 +266,10 @@ def test_so_does_one_of_another_host(sleep: str, far: Far, monkeypatch: pytest.M
 
 
 def test_so_does_the_dealer_of_a_queue() -> None:
-    inbox, outbox = one_way.pair()
+    inbox, outbox = local.one_way_pair()
     arrivals, door = LocalChannel.pair()
     Dealer(inbox, arrivals).start()
-    reader = dealer.arrive(door)
+    reader = queue_delivery.arrive(door)
     outbox.send(b"first")
     assert reader.recv().tobytes() == b"first"  # it sleeps before it looks again
     outbox.backlog.put(memoryview(b"unannounced"))
@@ -444,7 +443,7 @@ def test_a_process_killed_within_the_backlog_leaves_it_to_others() -> None:
 
 
 def test_threads_keep_their_own_order() -> None:
-    receiver, sender = one_way.pair()
+    receiver, sender = local.one_way_pair()
     writers = [
         threading.Thread(
             target=lambda who=who: [sender.send(b"%d %d" % (who, n)) for n in range(2000)]

@@ -20,8 +20,8 @@ import pytest
 import fiber
 from census import wait_until
 from fiber import queues
-from fiber._hub import feeder, local
-from fiber._hub.feeder import Feeder, ItemCount
+from fiber._hub import local, queue_delivery
+from fiber._hub.queue_delivery import Feeder, ItemCount
 from fiber._wire import packet
 from patience import PATIENCE
 from unit.interrupting import INSTRUCTIONS, is_interrupted
@@ -97,7 +97,7 @@ def test_a_place_that_is_given_back_twice_is_removed() -> None:
 
 def test_an_interrupted_get_frees_the_place_of_its_item() -> None:
     queue: Any = fiber.Queue(1)
-    files = {module.__file__ for module in (queues, feeder, local, packet)}
+    files = {module.__file__ for module in (queues, queue_delivery, local, packet)}
     for stop in itertools.count():
         queue.put(1)
         interrupted = is_interrupted(queue.get, stop, files, steps=INSTRUCTIONS)

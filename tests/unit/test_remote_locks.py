@@ -14,10 +14,10 @@ import pytest
 
 import fiber
 from census import wait_until
-from fiber._hub import shared_semaphores
-from fiber._hub.client import HubStream, Unreachable
+from fiber._hub import shared_blocks
+from fiber._hub.client import HubStream, ObjectUnreachable
 from fiber._hub.protocol import Op, Status
-from fiber._hub.shared_semaphores import RemoteSemaphore
+from fiber._hub.shared_blocks import RemoteSemaphore
 from fiber.synchronize import Abandoned
 from hosts import Far, Hosts, Wire, background, objects_kept
 from patience import PATIENCE
@@ -181,7 +181,7 @@ def test_who_waits_elsewhere_is_told_of_a_death(
     here: Any, far: Far, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one = far(here)
-    monkeypatch.setattr(shared_semaphores, "_known", WeakValueDictionary())
+    monkeypatch.setattr(shared_blocks, "_semaphores", WeakValueDictionary())
     other = far(here)  # in another process
     assert one.acquire()
     die_holding(one)
@@ -217,7 +217,7 @@ def test_a_link_that_ends_is_an_error_and_gives_it_back(here: Any, far: Far, hos
         hosts.on_loop(hosts["a"].unlink, "b", "it was cut")
         hosts.on_loop(hosts["b"].unlink, "a", "it was cut")
         assert here.acquire(timeout=PATIENCE)
-    with pytest.raises(Unreachable, match="it was cut"):
+    with pytest.raises(ObjectUnreachable, match="it was cut"):
         there.release()
 
 
@@ -249,7 +249,7 @@ def test_a_stream_for_something_else_is_refused(operation: Op, far: Far) -> None
     there = far(reader)
     with (
         there._channel.stream() as stream,
-        pytest.raises(Unreachable, match="not attached to a lock"),
+        pytest.raises(ObjectUnreachable, match="not attached to a lock"),
     ):
         stream.ask(operation, buffers=[memoryview(b"me")])
     for end in (there, reader, writer):

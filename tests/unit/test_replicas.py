@@ -11,7 +11,7 @@ import pytest
 
 import fiber
 from census import wait_until
-from fiber._hub.client import Unreachable
+from fiber._hub.client import ObjectUnreachable
 from fiber._hub.heap import Block
 from fiber._hub.protocol import NO_SECRET, Origin
 from fiber._hub.replicas import Replicas
@@ -149,9 +149,9 @@ def test_a_home_that_is_gone_leaves_what_was_known(hosts: Hosts, wires: tuple[Wi
     other = there.send(array)
     hosts.on_loop(hosts["b"].unlink, "a", "it was unplugged")
     with hosts.at("b"):
-        with pytest.raises(Unreachable, match="'a' cannot be reached"):
+        with pytest.raises(ObjectUnreachable, match="'a' cannot be reached"):
             pickle.loads(late)
-        with pytest.raises(Unreachable, match="unplugged"):
+        with pytest.raises(ObjectUnreachable, match="unplugged"):
             pickle.dumps(other)
     other[0] += 1
     assert other[0] == 8
@@ -164,7 +164,7 @@ def test_a_link_that_is_lost_while_somebody_waits(hosts: Hosts) -> None:
     hosts.on_loop(up.hold)
     with hosts.at("b"):
         hosts.loop.call_later(0.05, hosts["b"].unlink, "a", "it was unplugged")
-        with pytest.raises(Unreachable, match=r"'a' cannot be reached|unplugged"):
+        with pytest.raises(ObjectUnreachable, match=r"'a' cannot be reached|unplugged"):
             pickle.loads(data)
 
 

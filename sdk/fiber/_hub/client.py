@@ -31,7 +31,7 @@ class NoHub(FiberError, OSError):
     """A handle has to leave this process and no hub is there to keep what it stands for."""
 
 
-class Unreachable(ConnectionClosed):
+class ObjectUnreachable(ConnectionClosed):
     """An object of some hub that cannot be used any more, or never could; says why."""
 
     def __init__(self, host: str, reason: str) -> None:
@@ -205,7 +205,7 @@ class HubStream:
         try:
             self._send(form.pack(operation, number, *values), buffers, fds)
             reply = self._reply(number, timeout)
-        except Unreachable:
+        except ObjectUnreachable:
             raise
         except BaseException:
             # Ctrl-C, or what another signal's handler raised.
@@ -254,15 +254,15 @@ class HubStream:
         self._send(form.pack(operation, self._next(), *values))
 
     def receive(self) -> Reply:
-        """Receive the next message; Unreachable with the hub's reason at the end."""
+        """Receive the next message; ObjectUnreachable with the hub's reason at the end."""
         try:
             message = packet.receive(self._sock, descriptors=True)
         except (EOFError, ConnectionError) as error:
-            raise Unreachable(self._host, self._end) from error
+            raise ObjectUnreachable(self._host, self._end) from error
         try:
             if message.payload[0] == Status.GONE:
                 self._end = protocol.text(message.payload)
-                raise Unreachable(self._host, self._end)
+                raise ObjectUnreachable(self._host, self._end)
             return Reply(message)
         finally:
             message.close_descriptors()
@@ -328,5 +328,5 @@ def _connect(to: HubAddress) -> socket.socket:
     except OSError as error:
         sock.close()
         reason = f"nobody serves {to.path}, so its program has ended"
-        raise Unreachable(to.host, reason) from error
+        raise ObjectUnreachable(to.host, reason) from error
     return sock

@@ -28,8 +28,8 @@ from fiber._hub.protocol import (
     Origin,
     Status,
 )
-from fiber._hub.registry import Attachment, Hosted, NoSuchObject, Registry
-from fiber._hub.replicas import Identity, Replicas
+from fiber._hub.registry import Hosted, NoSuchObject, ObjectAttachment, Registry
+from fiber._hub.replicas import BlockIdentity, Replicas
 from fiber._hub.streams import NullHandler, Stream
 from fiber._wire.packet import Message
 
@@ -90,8 +90,8 @@ class ClientHandler:
         self.waiting: PendingRequest | None = None
         self._home = home
         self._admitted = False
-        self._attachment: Attachment | None = None
-        self._joined: Identity | None = None
+        self._attachment: ObjectAttachment | None = None
+        self._joined: BlockIdentity | None = None
         self._bound: set[bytes] = set()
         self._holder: str | None = None
         """Whose token the stream keeps."""
@@ -148,7 +148,7 @@ class ClientHandler:
         attachment, self._attachment = self._attachment, None
         if attachment is not None:
             if isinstance(attachment.shared.hosted, HostedChannel):
-                attachment.shared.hosted.forget(self)
+                attachment.shared.hosted.forget(self.ready)
             self._home.registry.detach(attachment)
         joined, self._joined = self._joined, None
         if joined is not None:
@@ -322,18 +322,18 @@ class ClientHandler:
 
     def watch(self, message: Message) -> None:
         """Say once when there is a message."""
-        self._channel().watch(self)
+        self._channel().watch(self.ready)
 
     def check(self, message: Message) -> None:
         """Say whether there is a message now, and once more on the stream itself when there is."""
         channel, number = self._channel(), HEAD.unpack_from(message.payload)[1]
-        channel.forget(self)
+        channel.forget(self.ready)
         if channel.readable():
             self.stream.send(HEAD.pack(Status.OK, number))
             self.ready()
         else:
             self.stream.send(HEAD.pack(Status.NO, number))
-            channel.watch(self)
+            channel.watch(self.ready)
 
     def ready(self) -> None:
         """The channel that this stream watches is readable."""

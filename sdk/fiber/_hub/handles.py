@@ -23,10 +23,17 @@ from multiprocessing import context as mp_context
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
 from fiber._hub import client
-from fiber._hub.client import HubStream, Unreachable
+from fiber._hub.client import HubStream, ObjectUnreachable
 from fiber._hub.heap import Block, block_of
-from fiber._hub.local import LocalChannel, LocalCounter
-from fiber._hub.one_way import ENDS, Backlog, OneWayEnd, Receiver, Sender
+from fiber._hub.local import (
+    ENDS,
+    Backlog,
+    LocalChannel,
+    LocalCounter,
+    OneWayEnd,
+    ReceivingEnd,
+    SendingEnd,
+)
 from fiber._hub.protocol import (
     FOUR,
     GRANTING,
@@ -44,7 +51,7 @@ from fiber._transport.channels import SharedChannel, SharedCounter, UnixChannel,
 from fiber._wire.descriptor import Descriptor, opened, own
 
 
-class InheritedDescriptor(Protocol):
+class DescriptorHandle(Protocol):
     """Stands for a descriptor that goes along with a start message."""
 
     def detach(self) -> int:
@@ -73,7 +80,7 @@ class HubHandle(NamedTuple):
             try:
                 return hub.fetch(self.grant)
             except NoSuchObject as error:
-                raise Unreachable(hub.host, str(error)) from None
+                raise ObjectUnreachable(hub.host, str(error)) from None
         stream = HubStream(self.home)
         try:
             reply = stream.ask(Op.FETCH, self.grant, form=SECRET)
@@ -82,7 +89,7 @@ class HubHandle(NamedTuple):
             stream.close()
 
 
-Handle: TypeAlias = InheritedDescriptor | HubHandle
+Handle: TypeAlias = DescriptorHandle | HubHandle
 
 
 class BlockHandle(NamedTuple):
@@ -178,15 +185,15 @@ def _handle_for_end(end: OneWayEnd) -> EndHandle:
     return EndHandle(end.kind, kept, None, extent)
 
 
-def _inherited(spawning: Any, fd: int) -> InheritedDescriptor:
-    handle: InheritedDescriptor = spawning.DupFd(spawning.duplicate_for_child(fd))
+def _inherited(spawning: Any, fd: int) -> DescriptorHandle:
+    handle: DescriptorHandle = spawning.DupFd(spawning.duplicate_for_child(fd))
     return handle
 
 
-def _inherited_segment(spawning: Any, block: Block) -> InheritedDescriptor:
+def _inherited_segment(spawning: Any, block: Block) -> DescriptorHandle:
     inherit = getattr(spawning, "inherit_segment", None)
     if inherit is not None:
-        segment: InheritedDescriptor = inherit(block.segment)
+        segment: DescriptorHandle = inherit(block.segment)
         return segment
     # multiprocessing's own Process takes each descriptor once, and closes it in the child.
     duplicate = opened(os.dup, block.segment.fileno())
@@ -379,7 +386,9 @@ class Pickling:
         if self.grants is not None:
             self.grants.release()
         while self.undo:
-            with contextlib.suppress(OSError, Unreachable):  # the hub is gone, and all with it
+            with contextlib.suppress(
+                OSError, ObjectUnreachable
+            ):  # the hub is gone, and all with it
                 self.undo.pop()()
 
 
@@ -388,7 +397,7 @@ def ring() -> None:
 
     Waits for nothing.  A hub that cannot be told, or is killed meanwhile, looks of its own accord.
     """
-    with contextlib.suppress(OSError, Unreachable):
+    with contextlib.suppress(OSError, ObjectUnreachable):
         hub = client.local_hub()
         if hub is not None:
             hub.doorbell.ring()
@@ -488,7 +497,7 @@ def _reduce_counter(end: Any) -> tuple[Any, ...]:
     return counter, (handle_for(end),)
 
 
-for _channel in (UnixChannel, LocalChannel, Receiver, Sender, RemoteChannel, RemoteEnd):
+for _channel in (UnixChannel, LocalChannel, ReceivingEnd, SendingEnd, RemoteChannel, RemoteEnd):
     copyreg.pickle(_channel, _reduce_channel)
 for _counter in (UnixCounter, LocalCounter, RemoteCounter):
     copyreg.pickle(_counter, _reduce_counter)

@@ -69,15 +69,15 @@ class Block:
     that never left this process is used again once it is forgotten: keep it while you use ``view``.
     """
 
-    __slots__ = ("__weakref__", "_place", "offset", "segment", "size")
+    __slots__ = ("__weakref__", "_allocation", "offset", "segment", "size")
 
     def __init__(
-        self, segment: Segment, offset: int, size: int, place: _Place | None = None
+        self, segment: Segment, offset: int, size: int, allocation: _Allocation | None = None
     ) -> None:
         self.segment = segment
         self.offset = offset
         self.size = size
-        self._place = place
+        self._allocation = allocation
 
     @property
     def view(self) -> memoryview:
@@ -96,11 +96,11 @@ class Block:
 
     def give(self) -> None:
         """Another process may use it from here on."""
-        if self._place is not None:
-            self._place.given = True
+        if self._allocation is not None:
+            self._allocation.given = True
 
 
-class _Place:
+class _Allocation:
     """Place of a small block.  It is reused after the block, unless other processes have it."""
 
     __slots__ = ("_forks", "_home", "_offset", "_segment", "given")
@@ -159,7 +159,7 @@ def allocate(size: int) -> Block:
         return Block(_new_segment("fiber-block", size), 0, size)
     home = _size_classes[bisect.bisect_left(SIZES, size)]
     segment, offset = home.take()
-    return Block(segment, offset, size, _Place(home, segment, offset))
+    return Block(segment, offset, size, _Allocation(home, segment, offset))
 
 
 def block_of(owner: Descriptor, offset: int, size: int) -> Block:

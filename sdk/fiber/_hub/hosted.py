@@ -17,8 +17,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
-from fiber._hub.local import LocalChannel, LocalCounter
-from fiber._hub.one_way import LOOK_AGAIN, Receiver
+from fiber._hub.local import LOOK_AGAIN, LocalChannel, LocalCounter, ReceivingEnd
 from fiber._hub.protocol import Doorbell, Status
 from fiber._hub.streams import EDGE, IN, OUT, Poller
 from fiber._sync.semaphore import COUNTING, SLICE, Abandoned, SharedBlock, SharedSemaphore, warn_of
@@ -34,13 +33,6 @@ class Waiter(Protocol):
         """Answer it; once."""
 
 
-class Watcher(Protocol):
-    """Wants to know when a channel becomes readable."""
-
-    def ready(self) -> None:
-        """Note that it is ready.  Called once for each time that the watcher asks."""
-
-
 class HostedChannel:
     """End of a channel that the hub serves."""
 
@@ -50,7 +42,7 @@ class HostedChannel:
         self._senders: deque[tuple[Waiter, Sequence[memoryview]]] = deque()
         self._receivers: deque[Waiter] = deque()
         self._pollers: deque[Waiter] = deque()
-        self._watchers: set[Watcher] = set()
+        self._watchers: set[Callable[[], None]] = set()
 
     def fileno(self) -> int:
         """Return the descriptor."""
@@ -83,10 +75,10 @@ class HostedChannel:
         """Tell whether there is a message or the end."""
         return self._channel.poll(0)
 
-    def watch(self, watcher: Watcher) -> None:
+    def watch(self, watcher: Callable[[], None]) -> None:
         """Say once when it is readable."""
         if self.readable():
-            watcher.ready()
+            watcher()
         else:
             self._watchers.add(watcher)
             self._watch()
@@ -105,7 +97,7 @@ class HostedChannel:
                 return True
         return False
 
-    def forget(self, watcher: Watcher) -> None:
+    def forget(self, watcher: Callable[[], None]) -> None:
         """Stop watching for ``watcher``."""
         self._watchers.discard(watcher)
         self._watch()
@@ -170,7 +162,7 @@ class HostedChannel:
                 self._pollers.popleft().answer(Status.OK)
             watchers, self._watchers = self._watchers, set()
             for watcher in watchers:
-                watcher.ready()
+                watcher()
 
 
 class HostedReceiver(HostedChannel):
@@ -180,7 +172,7 @@ class HostedReceiver(HostedChannel):
     the wake-up packet wakes nobody.
     """
 
-    def __init__(self, loop: Loop, poller: Poller, channel: Receiver) -> None:
+    def __init__(self, loop: Loop, poller: Poller, channel: ReceivingEnd) -> None:
         super().__init__(poller, channel)
         self._loop = loop
         self._is_looking = False

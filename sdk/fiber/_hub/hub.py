@@ -22,7 +22,7 @@ from queue import Empty, SimpleQueue
 
 from fiber._exceptions import fresh
 from fiber._hub import protocol
-from fiber._hub.client import NoHub, Unreachable
+from fiber._hub.client import NoHub, ObjectUnreachable
 from fiber._hub.client_handler import ClientHandler
 from fiber._hub.directory import remove_directory
 from fiber._hub.heap import block_of
@@ -34,14 +34,19 @@ from fiber._hub.hosted import (
     HostedSemaphore,
     HostedWaitList,
 )
-from fiber._hub.local import LocalChannel, LocalCounter, QuietSocket, without_timeout
-from fiber._hub.one_way import ENDS, Backlog, Receiver
+from fiber._hub.local import (
+    ENDS,
+    Backlog,
+    LocalChannel,
+    LocalCounter,
+    QuietSocket,
+    ReceivingEnd,
+    without_timeout,
+)
 from fiber._hub.protocol import Doorbell, HubAddress, ObjectKind
 from fiber._hub.registry import Hosted, Registry, SharedObject
 from fiber._hub.replicas import MemoryLink, Replicas
-from fiber._hub.streams import Poller, SocketStream, Stream
-from fiber._hub.tunnel import Frame as TunnelFrame
-from fiber._hub.tunnel import Router, Tunnels
+from fiber._hub.streams import Poller, Router, SocketStream, Stream, TunnelFrame, Tunnels
 from fiber._transport.channels import naming_the_limit, socketpair
 from fiber._transport.loop import DOZE, Loop
 from fiber._wire.descriptor import Descriptor, own
@@ -134,7 +139,7 @@ class Hub:
             if isinstance(answer, Exception):
                 raise fresh(answer)
             return answer
-        raise Unreachable(self.host, "the program that keeps it has ended")
+        raise ObjectUnreachable(self.host, "the program that keeps it has ended")
 
     def _answer(self, grant: bytes, answers: SimpleQueue[list[Descriptor] | Exception]) -> None:
         try:
@@ -142,7 +147,7 @@ class Hub:
         except Exception as error:
             answers.put(error)
 
-    def link(self, host: str | None, send: Send, *, dialer: bool) -> HubLink:
+    def link(self, host: str | None, send: SendHubMessage, *, dialer: bool) -> HubLink:
         """The hub of ``host`` can be reached by frames that go out by ``send``.
 
         None stands for every host that has no link of its own, as an agent's link to the master.
@@ -245,7 +250,7 @@ class Hub:
         if shared.kind in ENDS:
             (segment,) = beside
             end = ENDS[shared.kind](fd, Backlog(block_of(segment, *shared.extent)))
-            if isinstance(end, Receiver):
+            if isinstance(end, ReceivingEnd):
                 return HostedReceiver(self._loop, self._poller, end)
             return HostedChannel(self._poller, end)
         if shared.kind is ObjectKind.SEMAPHORE:
@@ -284,7 +289,7 @@ def _problem(error: OSError) -> str:
     )
 
 
-Send = Callable[[HubMessage], None]
+SendHubMessage = Callable[[HubMessage], None]
 
 
 class HubLink:
@@ -296,7 +301,7 @@ class HubLink:
     memory: MemoryLink
     tunnels: Tunnels
 
-    def __init__(self, call_soon: Callable[..., None], send: Send) -> None:
+    def __init__(self, call_soon: Callable[..., None], send: SendHubMessage) -> None:
         self._call_soon = call_soon
         self._send = send
         self._waiting: deque[TunnelFrame] = deque()

@@ -1,21 +1,59 @@
-"""Channels and counters of this host with many holders, of which some can wait and some cannot."""
+"""Channels and counters of this host with many holders, of which some can wait and some cannot.
+
+A *one-way channel* holds as many unread messages as a pipe does.  The kernel counts about 800 bytes
+of a socket's buffer for every packet, so a socket holds fewer small messages than a pipe.  Messages
+that do not fit go into a *backlog* in shared memory, until the backlog is empty again.  Messages in
+the socket are older than those in the backlog::
+
+    SendingEnd ──┬─ the backlog is empty ──► socket ────────────┬─► ReceivingEnd
+                 └─ the socket is full ────► backlog, wake-up ──┘
+
+* As long as nothing overflows, neither end takes a lock or needs another system call.
+* While there is a backlog, its socket holds a *wake-up* packet behind all messages, so that its
+  descriptor is readable and a receiver that sleeps wakes.  A receiver finds the packet at the head
+  of the socket and takes from the backlog.  In the packet is a descriptor of the sending end:
+  a receiver that has removed it sends it again, and wakes the next one.
+* A sender that has checked the backlog a moment too early may send behind the wake-up packet.  It
+  notes that (``AMBIGUOUS``), and the next receiver moves the packet to the end.
+* A sender that finds the backlog full waits for a packet in the other direction.
+* If a receiver dies while it has the wake-up packet, no message is lost, but other receivers are
+  not woken.  They look at the backlog each second, as the hub and the dealer of a queue do for
+  their readers, and the next sender finds the socket empty and sends another wake-up packet.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import os
 import select
 import socket
+import struct
+import termios
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, TypeVar
 
-from fiber._transport.channels import Claimant, UnixChannel, UnixCounter, grow
+from fiber._hub import heap
+from fiber._hub.protocol import ObjectKind
+from fiber._sync.liveness import RobustMutex
+from fiber._transport.channels import (
+    BorrowedSocket,
+    Claimant,
+    UnixChannel,
+    UnixCounter,
+    connected,
+    grow,
+    wait_readable,
+    wait_until,
+)
 from fiber._transport.loop import LONGEST_POLL
 from fiber._wire import packet
 from fiber._wire.descriptor import Descriptor
 from fiber._wire.memory_files import BytesLike
 from fiber._wire.packet import Message
+from fiber.errors import ConnectionClosed
 
 _Socket = TypeVar("_Socket", bound=socket.socket)
 
@@ -118,3 +156,383 @@ class LocalCounter(UnixCounter):
                     return False
                 poller.poll(None if left is None else min(left, LONGEST_POLL))
         return True
+
+
+# One-way channels
+
+HEAD, TAIL = 8, 9
+"""Words.  Where they differ, there are records."""
+
+_NEEDED = 10
+"""Word: free bytes that a sender waits for, or 0.  While it waits, no other sender puts."""
+
+AMBIGUOUS = 11
+"""Word: whether the socket has messages behind a wake-up packet."""
+
+UNANNOUNCED = 12
+"""Word: whether a wake-up packet is missing."""
+
+ROOM = 13
+"""Word: the usual size of the socket's buffer."""
+
+_HEADER = 128
+_SIZE = heap.LARGE - 8  # small blocks share a segment, and with it a descriptor
+_LENGTH = 4
+
+_Result = TypeVar("_Result")
+
+
+class Backlog:
+    """The ring, as this process sees it.  Changed only within ``run``."""
+
+    __slots__ = ("_capacity", "_data", "_mutex", "block", "words")
+
+    def __init__(self, block: heap.Block) -> None:
+        self.block = block
+        self.words = block.view[:_HEADER].cast("q")
+        self._data = block.view[_HEADER:]
+        self._capacity = len(self._data)
+        self._mutex = RobustMutex(block.address)
+
+    @classmethod
+    def create(cls) -> Backlog:
+        """Make an empty one."""
+        new = cls(heap.allocate(_SIZE))
+        new._mutex.create()
+        return new
+
+    def run(self, action: Callable[[], _Result]) -> _Result:
+        """Return what ``action`` returns, called while no other thread or process is in ``run``."""
+        return self._mutex.run(action)
+
+    def __bool__(self) -> bool:
+        words = self.words
+        return words[HEAD] != words[TAIL]
+
+    def holds_one(self) -> bool:
+        """Tell whether the next record is the last one."""
+        head = self.words[HEAD]
+        return head + _LENGTH + self._length(head) == self.words[TAIL]
+
+    def fits(self, size: int) -> bool:
+        """Tell whether a payload of ``size`` bytes fits in at all."""
+        return size + _LENGTH <= self._capacity
+
+    def put(self, payload: memoryview) -> bool:
+        """Append a record; False if there is no room, or an earlier sender waits for some."""
+        words, size = self.words, payload.nbytes
+        while True:
+            tail = words[TAIL]
+            end = tail + _LENGTH + size
+            if words[_NEEDED] or end - words[HEAD] > self._capacity:
+                return False
+            self._write(tail, memoryview(size.to_bytes(_LENGTH, "little")))
+            self._write(tail + _LENGTH, payload)
+            if words[TAIL] == tail:  # else a finalizer or a signal's handler has put meanwhile
+                words[TAIL] = end
+                return True
+
+    def take(self, say_room: Callable[[], None]) -> bytes:
+        """Remove the first record; first ``say_room`` if a sender waits and there will be room."""
+        words = self.words
+        while True:
+            head = words[HEAD]
+            start = head + _LENGTH
+            end = start + self._length(head)
+            payload = self._read(start, end)
+            needed = words[_NEEDED]
+            if needed and self._capacity - (words[TAIL] - end) >= needed:
+                say_room()  # first: after a death here a sender looks once in vain
+                words[_NEEDED] = 0
+            if words[HEAD] == head:
+                words[HEAD] = end
+                return payload
+
+    def need(self, size: int) -> None:
+        """Note that a sender waits for room: all of it where the payload does not fit in."""
+        wanted = max(size + _LENGTH, self._capacity // 2)
+        self.words[_NEEDED] = max(self.words[_NEEDED], min(wanted, self._capacity))
+
+    def _length(self, at: int) -> int:
+        return int.from_bytes(self._read(at, at + _LENGTH), "little")
+
+    def _write(self, at: int, data: memoryview) -> None:
+        at %= self._capacity
+        first = min(len(data), self._capacity - at)
+        self._data[at : at + first] = data[:first]
+        self._data[: len(data) - first] = data[first:]
+
+    def _read(self, at: int, end: int) -> bytes:
+        size = end - at
+        at %= self._capacity
+        data = self._data[at : at + size].tobytes()
+        return data if len(data) == size else data + self._data[: size - len(data)].tobytes()
+
+
+LOOK_AGAIN = 1.0
+"""Seconds after which a receiver that sleeps looks at the backlog."""
+
+_DONTWAIT = int(socket.MSG_DONTWAIT)
+_PEEK = int(socket.MSG_PEEK) | _DONTWAIT
+_IS_WAKE_UP = bytes([packet.WAKE_UP])
+_INT = struct.Struct("i")
+_RECEIVE_TIMEOUT = struct.pack("ll", int(LOOK_AGAIN), 0)
+
+
+class OneWayEnd(LocalChannel):
+    """End of a one-way channel: a socket, and the backlog that all holders of both ends share."""
+
+    __slots__ = ("_words", "backlog")
+
+    kind: ObjectKind
+
+    def __init__(self, owner: Descriptor, backlog: Backlog) -> None:
+        super().__init__(owner)
+        self.backlog = backlog
+        self._words = backlog.words
+
+
+class SendingEnd(OneWayEnd):
+    """The end that sends."""
+
+    __slots__ = ("_room_events",)
+
+    kind = ObjectKind.SENDER
+
+    def __init__(self, owner: Descriptor, backlog: Backlog) -> None:
+        super().__init__(owner, backlog)
+        self._room_events = 0
+
+    def send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
+        """Send one message, waiting for room; a bulky one until it is read."""
+        bulky = self._send_now(payload, buffers)
+        if bulky is None:
+            self._send_in_turn(payload, buffers)
+            bulky = packet.is_bulky(payload, buffers)
+        if bulky:
+            wait_until(self.fileno(), select.POLLOUT)
+
+    send_unconfirmed = send
+
+    def post(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
+        """Send one message, waiting for room but not until it is read."""
+        if self._send_now(payload, buffers) is None:
+            self._send_in_turn(payload, buffers)
+
+    def try_send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
+        """Send one message if there is room for it now."""
+        if self._send_now(payload, buffers) is not None:
+            return True
+        self._room_events = self.backlog.run(partial(self._place, payload, buffers))
+        return not self._room_events
+
+    @property
+    def room_events(self) -> int:
+        """Event of ``fileno()`` after which ``try_send`` is worth another try."""
+        return self._room_events or select.POLLOUT
+
+    def _send_now(self, payload: BytesLike, buffers: Sequence[memoryview]) -> bool | None:
+        """Send through the socket, if it is the turn of that; True: the message is bulky."""
+        words = self._words
+        if words[HEAD] != words[TAIL]:
+            return None
+        try:
+            bulky = packet.send(self._sock, payload, buffers, ballast=True, wait=False)
+        except BlockingIOError:
+            return None
+        if words[HEAD] != words[TAIL]:
+            words[AMBIGUOUS] = True
+        return bulky
+
+    def _send_in_turn(self, payload: BytesLike, buffers: Sequence[memoryview]) -> None:
+        while events := self.backlog.run(partial(self._place, payload, buffers)):
+            wait_until(self.fileno(), events)
+
+    # Within ``backlog.run``
+
+    def _place(self, payload: BytesLike, buffers: Sequence[memoryview]) -> int:
+        """Send the message or put it into the backlog: 0, or the event to wait for first."""
+        is_first = not self.backlog
+        if is_first:
+            with contextlib.suppress(BlockingIOError):
+                packet.send(self._sock, payload, buffers, ballast=True, wait=False)
+                return 0
+        view = memoryview(payload).cast("B")
+        fits = not buffers and self.backlog.fits(view.nbytes)
+        if is_first and not fits:
+            return select.POLLOUT
+        if not (fits and self.backlog.put(view)):
+            self._forget_room()
+            self.backlog.need(packet.size_of(payload, buffers))
+            return select.POLLIN
+        if is_first or self._words[UNANNOUNCED] or self._nothing_unread():
+            self._words[UNANNOUNCED] = True
+            _wake_up(self._sock, self._words)
+        return 0
+
+    def _forget_room(self) -> None:
+        """Remove what receivers have said about room; BrokenPipeError if all are gone."""
+        try:
+            while self._sock.recv(1, _DONTWAIT):
+                pass
+        except BlockingIOError:
+            return
+        except ConnectionResetError:  # they left messages unread
+            pass
+        raise BrokenPipeError("the other end is closed")
+
+    def _nothing_unread(self) -> bool:
+        """Tell whether the socket is empty: then its wake-up packet is lost."""
+        return fcntl.ioctl(self._sock, termios.TIOCOUTQ, bytes(_INT.size)) == bytes(_INT.size)
+
+
+class ReceivingEnd(OneWayEnd):
+    """The end that receives."""
+
+    __slots__ = ()
+
+    kind = ObjectKind.RECEIVER
+
+    def recv(self, *, passing: bool = False) -> Message:
+        """Return the next message; ConnectionClosed at the end."""
+        while True:
+            message = self._next(wait=True, passing=passing)
+            if message is not None:
+                return message
+
+    def recv_object(self) -> Any:
+        """Return the object in the next message; ConnectionClosed at the end."""
+        words = self._words
+        if words[HEAD] == words[TAIL]:
+            try:
+                return packet.receive_object(self._sock)
+            except packet.NothingYet:
+                pass
+            except packet.WakeUp as wake_up:
+                message = self._take(wake_up.sender)
+                if message is not None:
+                    return packet.loads(message)
+        return packet.loads(self.recv())
+
+    recv_answer = recv
+
+    def try_recv(self) -> Message | None:
+        """Return the next message if there is one; ConnectionClosed at the end."""
+        return self._next(wait=False)
+
+    def poll(self, timeout: float | None) -> bool:
+        """Tell whether ``recv`` would return or raise at once."""
+        deadline = None if timeout is None else time.monotonic() + timeout
+        while not self.backlog:
+            left = LOOK_AGAIN if deadline is None else deadline - time.monotonic()
+            if wait_readable(self.fileno(), max(0.0, min(left, LOOK_AGAIN))):
+                return True
+            if left <= 0:
+                return False
+        return True
+
+    def _next(self, *, wait: bool, passing: bool = False) -> Message | None:
+        """Return the next message, or None: at once, or after a while."""
+        while True:
+            if self.backlog:
+                message = self._take()
+                if message is not None:
+                    return message
+            try:
+                return packet.receive(self._sock, wait=wait, passing=passing)
+            except BlockingIOError:
+                if not self.backlog:
+                    return None
+            except ConnectionClosed:
+                if not self.backlog:
+                    raise
+            except packet.WakeUp as wake_up:
+                message = self._take(wake_up.sender)
+                if message is not None:
+                    return message
+
+    def _take(self, sender: Descriptor | None = None) -> Message | None:
+        """Return the next message of socket and backlog; None if there is no backlog.
+
+        ``sender`` is that of a wake-up packet that the caller has removed.
+        """
+        return self.backlog.run(partial(self._take_in_order, sender))
+
+    # Within ``backlog.run``
+
+    def _take_in_order(self, sender: Descriptor | None) -> Message | None:
+        words = self._words
+        while self.backlog:
+            head = self._peek()
+            last = self.backlog.holds_one()
+            if not head or (head == _IS_WAKE_UP and not (last or words[AMBIGUOUS])):
+                if sender is not None and not head and not last:
+                    self._pass_on(sender)
+                return Message(memoryview(self.backlog.take(self._say_room)), [], [])
+            try:
+                message = packet.receive(self._sock, wait=False)
+            except packet.WakeUp as wake_up:
+                # Others may have removed it first.  The last record goes without one.
+                sender = wake_up.sender
+                if words[AMBIGUOUS]:
+                    words[AMBIGUOUS] = False
+                    self._pass_on(sender)
+                    sender = None
+            except (BlockingIOError, ConnectionClosed):
+                pass  # another receiver has taken what was there
+            else:
+                if sender is not None:
+                    self._pass_on(sender)
+                return message
+        return None
+
+    def _pass_on(self, sender: Descriptor) -> None:
+        # Without it, others are woken later.
+        with contextlib.suppress(OSError):
+            _wake_up(BorrowedSocket(sender), self._words)
+
+    def _peek(self) -> bytes:
+        """Return the first byte of the next packet; b"" if there is none."""
+        for _ in range(2):
+            try:
+                return self._sock.recv(1, _PEEK)
+            except BlockingIOError:
+                break
+            except ConnectionResetError:  # senders have left our packets unread; said once
+                pass
+        return b""
+
+    def _say_room(self) -> None:
+        with contextlib.suppress(OSError):  # it was said already, or all senders are gone
+            self._sock.send(b"\0", _DONTWAIT)
+
+
+ENDS: dict[ObjectKind, type[SendingEnd | ReceivingEnd]] = {
+    ObjectKind.SENDER: SendingEnd,
+    ObjectKind.RECEIVER: ReceivingEnd,
+}
+
+
+def one_way_pair() -> tuple[ReceivingEnd, SendingEnd]:
+    """Return the two ends of a new channel."""
+    backlog = Backlog.create()  # first: an error in there must not keep the sockets open
+    one, other = connected()
+    receiver, sender = ReceivingEnd(one, backlog), SendingEnd(other, backlog)
+    backlog.words[ROOM] = sender.sock.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF)
+    receiver.sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, _RECEIVE_TIMEOUT)
+    return receiver, sender
+
+
+def _wake_up(sock: socket.socket, words: memoryview) -> None:
+    """Send a wake-up packet, for which the socket's buffer grows for a moment."""
+    usual = words[ROOM]
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, usual)  # the kernel doubles it
+    try:
+        packet.send_wake_up(sock, sock.fileno())
+        words[UNANNOUNCED] = False
+    except BlockingIOError:
+        pass  # the system does not let it grow
+    except ConnectionResetError as error:
+        raise BrokenPipeError("the other end is closed") from error
+    finally:
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, usual // 2)

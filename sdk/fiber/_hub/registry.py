@@ -89,7 +89,7 @@ class SharedObject:
             server.close()
 
 
-class Attachment(NamedTuple):
+class ObjectAttachment(NamedTuple):
     """Stream of a user of an object."""
 
     shared: SharedObject
@@ -181,7 +181,7 @@ class Registry:
         self._use(grant)
         return fds
 
-    def attach(self, token: bytes, grant: bytes = NO_SECRET) -> Attachment:
+    def attach(self, token: bytes, grant: bytes = NO_SECRET) -> ObjectAttachment:
         """Attach a user on another host; ``detach`` ends that.
 
         A user that is attached already may attach again with the same token and no grant.
@@ -195,7 +195,7 @@ class Registry:
         shared.attached += 1
         self._users.setdefault(token, []).append(shared)
         self._use(grant)
-        return Attachment(shared, token)
+        return ObjectAttachment(shared, token)
 
     def hosted(self, token: bytes) -> Hosted:
         """Return what the user of this token is attached to."""
@@ -205,7 +205,7 @@ class Registry:
         """Return the object that the user is attached to, or may attach to by this grant."""
         return self._used_by(token) if token in self._users else self._granted(grant)
 
-    def detach(self, attachment: Attachment) -> None:
+    def detach(self, attachment: ObjectAttachment) -> None:
         """Remove one stream."""
         shared, token = attachment
         streams = self._users[token]

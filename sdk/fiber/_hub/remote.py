@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any, TypeAlias
 
-from fiber._hub.client import HubStream, Reply, Unreachable
+from fiber._hub.client import HubStream, ObjectUnreachable, Reply
 from fiber._hub.protocol import (
     HEAD,
     NO_SECRET,
@@ -88,7 +88,7 @@ class RemoteObject:
     def confirm(self) -> None:
         """Returns once its hub knows that it is used, or cannot be asked."""
         if not any(stream.has_answered for stream in tuple(self._streams)):
-            with suppress(OSError, Unreachable), self.stream() as stream:
+            with suppress(OSError, ObjectUnreachable), self.stream() as stream:
                 stream.ask(Op.SYNC, 0, form=ONE)
 
     def known(self) -> bytes:
@@ -346,7 +346,7 @@ class RemoteCounter(RemoteObject):
 def _naming_the_end() -> Iterator[None]:
     try:
         yield
-    except Unreachable as error:
+    except ObjectUnreachable as error:
         raise BrokenPipeError(str(error)) from error
 
 

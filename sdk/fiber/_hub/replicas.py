@@ -172,9 +172,9 @@ def _write(memory: bytearray, runs: list[Run] | Iterator[Run]) -> None:
         memory[start : start + len(data)] = data
 
 
-Identity = tuple[str, bytes]
+BlockIdentity = tuple[str, bytes]
 """Home of a block, and its secret identity there."""
-Send = Callable[[MemoryMessage], None]
+SendMemoryMessage = Callable[[MemoryMessage], None]
 
 
 class _Kind(IntEnum):
@@ -231,10 +231,10 @@ class Replicas:
     def __init__(self, host: str, registry: Registry) -> None:
         self._host = host
         self._registry = registry
-        self._replicas: dict[Identity, Replica] = {}
+        self._replicas: dict[BlockIdentity, Replica] = {}
         self._links: dict[str | None, MemoryLink] = {}
 
-    def link(self, host: str | None, send: Send, *, dialer: bool) -> MemoryLink:
+    def link(self, host: str | None, send: SendMemoryMessage, *, dialer: bool) -> MemoryLink:
         """A new link, as the router's."""
         link = self._links[host] = MemoryLink(self, send, dialer=dialer)
         return link
@@ -262,7 +262,7 @@ class Replicas:
         else:
             replica.joiners.append(joiner)
 
-    def leave(self, identity: Identity, user: object) -> None:
+    def leave(self, identity: BlockIdentity, user: object) -> None:
         """Note that ``user`` no longer uses the block."""
         replica = self._replicas.get(identity)
         if replica is None or user not in replica.users:
@@ -273,7 +273,7 @@ class Replicas:
             if replica.upstream is not None:
                 replica.upstream.link.leave(replica.upstream)
 
-    def at(self, identity: Identity) -> Replica:
+    def at(self, identity: BlockIdentity) -> Replica:
         """A block that is here."""
         return self._replicas[identity]
 
@@ -319,7 +319,7 @@ class Replicas:
 class MemoryLink:
     """The blocks that both sides of one link have."""
 
-    def __init__(self, home: Replicas, send: Send, *, dialer: bool) -> None:
+    def __init__(self, home: Replicas, send: SendMemoryMessage, *, dialer: bool) -> None:
         self._home = home
         self._send = send
         self._numbers = itertools.count(1 if dialer else 2, 2)
@@ -331,7 +331,7 @@ class MemoryLink:
         return bool(self._shares)
 
     def flush(self) -> None:
-        """Send what has changed here, ahead of what is about to be sent."""
+        """SendMemoryMessage what has changed here, ahead of what is about to be sent."""
         for share in self._shares.values():
             self._flush(share)
 
@@ -429,13 +429,13 @@ class MemoryLink:
 class _Downstream:
     """The other side of a link, which has joined here or waits for that; a ``Joiner``."""
 
-    def __init__(self, link: MemoryLink, number: int, identity: Identity) -> None:
+    def __init__(self, link: MemoryLink, number: int, identity: BlockIdentity) -> None:
         self.number = number
         self.identity = identity
         self._link = link
 
     def joined(self, block: Block) -> None:
-        """Send it on."""
+        """SendMemoryMessage it on."""
         self._link.accepted(self)
 
     def refused(self, reason: str) -> None:

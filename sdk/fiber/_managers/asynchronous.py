@@ -22,7 +22,7 @@ from typing import Any
 
 from fiber import reduction
 from fiber._exceptions import fresh
-from fiber._hub.client import Unreachable
+from fiber._hub.client import ObjectUnreachable
 from fiber._managers.client import NUMBER, ManagerSession, new_holder, proxy_of, session
 from fiber._runtime.latch import Waiters, acquire
 from fiber.errors import ConnectionClosed, TimeoutError
@@ -157,7 +157,7 @@ class Pipeline:
             answer: tuple[int, str, Any] = self._channel.recv_object()
             return answer
         except ConnectionClosed as error:
-            if isinstance(error, Unreachable):  # an object in the answer is, not the server
+            if isinstance(error, ObjectUnreachable):  # an object in the answer is, not the server
                 return self._answered + 1, "#ERROR", error
             raise _Ended from error
         except Exception as error:  # the answer does not unpickle

@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 
 from fiber import reduction
 from fiber._hub import handles
-from fiber._hub.client import Unreachable, host
+from fiber._hub.client import ObjectUnreachable, host
 from fiber._hub.handles import HubHandle, collecting_grants
 from fiber._hub.local import LocalChannel
 from fiber._transport.channels import Channel
@@ -346,7 +346,7 @@ class ManagerConnection:
         try:
             kind, result = channel.answer()
         except ConnectionClosed as error:
-            if isinstance(error, Unreachable):
+            if isinstance(error, ObjectUnreachable):
                 raise  # an object in the answer is unreachable, not the server
             self._session.give_up(channel)
             raise self._session.closed_error() from error

@@ -57,7 +57,7 @@ from fiber._sync.liveness import RobustMutex
 RECURSIVE, COUNTING = 0, 1  # SemLock's kinds, in its own numbers
 SEM_VALUE_MAX: int = SemLock.SEM_VALUE_MAX
 
-SIZE = 1 << 15
+SEMAPHORE_SIZE = 1 << 15
 """Bytes of a semaphore.  The kernel gives memory for the pages that are used."""
 
 SLICE = 0.2
@@ -76,7 +76,7 @@ _IS_UNTRACKED = 17
 _TOTAL = 18
 _MAXIMUM = 19
 _DEAD = range(20, 31)  # whose token was given back, in words
-_SLOTS = range(32, SIZE // 8, 8)
+_SLOTS = range(32, SEMAPHORE_SIZE // 8, 8)
 _NO_SLOT = 31
 """Mark in place of a slot, when there are no more."""
 

@@ -20,13 +20,13 @@ from typing import Protocol
 from fiber._sync import liveness
 from fiber._sync.semaphore import SLICE, SharedBlock, make_semaphore, semaphore_at
 
-SIZE = 1 << 15
+WAIT_LIST_SIZE = 1 << 15
 
 # Words of 8 bytes
 _TICKET = 0
 _USERS = 1
 _END = 3  # of the places that anybody ever had
-_PLACES = range(8, SIZE // 8, 8)
+_PLACES = range(8, WAIT_LIST_SIZE // 8, 8)
 # Of a place
 _STATE = 0
 _WHO = 1  # the process, or 0: it is free

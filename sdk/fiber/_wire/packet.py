@@ -11,7 +11,7 @@ Layout (little endian)::
                         then payload and buffers, here or (IN_MEMFD) in the first descriptor
     kind:u8 = PASSED    the same, then where each of them lies in the first descriptor:u64 (0 for
                         the payload: here); they came from another host, and lie where they arrived
-    kind:u8 = WAKE_UP   no message: it says that a backlog has some (``fiber._hub.one_way``)
+    kind:u8 = WAKE_UP   no message: it says that a backlog has some (``fiber._hub.local``)
 
 Buffers are pickle protocol 5's out-of-band buffers (PEP 574).
 """

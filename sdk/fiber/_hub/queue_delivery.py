@@ -1,15 +1,24 @@
-"""Feeding of a queue: from ``put`` into its channel, the count of items, and the places they take.
+"""Delivery of a queue's items: from ``put`` into its channel, and to readers elsewhere.
 
-A process that puts an item into a bounded queue takes a place for it.  The place of an item that
-was sent comes back when the item is received.  An item that was not sent yet is in the memory of
-its process and dies with the process. So each process keeps the number of its unsent items in a
-table in shared memory, where other processes find it after its death.
+A *feeder* sends the items that did not fit into the channel when they were put.  It also counts the
+items and the slots that they take.  A process that puts an item into a bounded queue takes a slot
+for it.  The slot of an item that was sent becomes free when the item is received.  An item that was
+not sent yet is in the memory of its process, and is lost when the process dies.  So each process
+keeps the number of its unsent items in a table in shared memory, where other processes find it.
+
+A *dealer* gives the items to the readers in turn, before they ask::
+
+    put ── inbox ──► Dealer, a thread of the queue's maker ──┬─► a reader's own channel ──► get
+                           ▲                                 └─► another reader's
+    the first get ── arrivals
 """
 
 from __future__ import annotations
 
 import math
 import os
+import pickle
+import select
 import threading
 import time
 import weakref
@@ -21,15 +30,17 @@ from queue import SimpleQueue
 from typing import Any
 
 from fiber._exceptions import report_uncaught
-from fiber._hub import shared_semaphores, wait_lists
-from fiber._hub.client import Unreachable
-from fiber._hub.local import LocalCounter
-from fiber._hub.shared_semaphores import AnySemaphore
-from fiber._hub.wait_lists import AnyWaitList
+from fiber._hub import local, shared_blocks
+from fiber._hub.client import ObjectUnreachable
+from fiber._hub.handles import collecting_grants
+from fiber._hub.local import LocalChannel, LocalCounter, ReceivingEnd, SendingEnd
+from fiber._hub.remote import RemoteObject
+from fiber._hub.shared_blocks import AnySemaphore, AnyWaitList
 from fiber._sync.semaphore import COUNTING
-from fiber._transport.channels import SharedChannel, SharedCounter
+from fiber._transport.channels import Channel, SharedChannel, SharedCounter
 from fiber._wire import packet
 from fiber._wire.packet import Message
+from fiber.errors import ConnectionClosed
 
 _LOOK_FOR_THE_DEAD = 1.0
 """Seconds that ``put`` waits at a time."""
@@ -41,7 +52,7 @@ _MOVE = 1e-4
 """Seconds to wait while an item moves: its thread may have to wait for a processor."""
 
 
-class Slots:
+class QueueSlots:
     """The places of a queue with a maximum size: a count of those that are free.
 
     The places of a process that dies before it has sent its items become free again.  If it dies
@@ -51,7 +62,7 @@ class Slots:
 
     def __init__(self, maximum: int) -> None:
         self._maximum = maximum
-        self._claims = Claims()
+        self._claims = SlotClaims()
         self._free: SharedCounter = LocalCounter.create(maximum)
         self._next_count = math.inf
 
@@ -170,7 +181,7 @@ class Feeder:
         self,
         owner: Any,
         outbox: SharedChannel,
-        slots: Slots | ItemCount,
+        slots: QueueSlots | ItemCount,
         *,
         on_error: Callable[[Exception, Any], None],
         close: Callable[[], None],
@@ -319,11 +330,13 @@ _LOOK = 0.2
 """Seconds between two looks for dead processes."""
 
 
-class Claims:
+class SlotClaims:
     """The table, and the claims of this process.  Any thread."""
 
     def __init__(self) -> None:
-        self.__setstate__((wait_lists.create(), shared_semaphores.create(COUNTING, 1, 1)))
+        self.__setstate__(
+            (shared_blocks.create_wait_list(), shared_blocks.create_semaphore(COUNTING, 1, 1))
+        )
 
     def __getstate__(self) -> tuple[AnyWaitList, AnySemaphore]:
         return self._table, self._lock
@@ -377,7 +390,7 @@ class Claims:
                 self._table.hold(entry, count)
                 if count == len(own):  # else another thread may have told the old number last
                     return
-        except (OSError, Unreachable):
+        except (OSError, ObjectUnreachable):
             pass  # the hub is gone, and the queue with it
 
     def _enter(self) -> None:
@@ -388,3 +401,115 @@ class Claims:
                 weakref.finalize(self, self._table.dismiss, self._entry[-1])
         finally:
             self._lock.release()
+
+
+# Dealing to readers
+
+_LOOK_AGAIN = 0.5
+"""Seconds after which a reader that arrives looks whether anybody is there."""
+
+
+class Dealer:
+    """Deals what comes by ``inbox`` to those who come by ``arrivals``, until ``inbox`` ends.
+
+    Each item goes to the next reader that has room for it; without one it waits, and the others
+    behind it in ``inbox``.
+    """
+
+    def __init__(self, inbox: ReceivingEnd, arrivals: LocalChannel) -> None:
+        self._inbox = inbox
+        self._arrivals = arrivals
+        self._readers: deque[SendingEnd] = deque()
+        self._item: Message | None = None
+
+    def start(self) -> None:
+        """Start dealing on a daemon thread."""
+        threading.Thread(target=self._run, name="fiber-dealer", daemon=True).start()
+
+    def _run(self) -> None:
+        try:
+            while True:
+                self._wait()
+                if self._arrivals.poll(0):
+                    self._welcome()
+                if self._item is None:
+                    self._item = self._inbox.try_recv()
+                if self._item is not None and self._deal(self._item):
+                    self._item.release()
+                    self._item = None
+        except ConnectionClosed:  # nobody has the queue any more
+            pass
+        finally:
+            for channel in (self._inbox, self._arrivals, *self._readers):
+                channel.close()
+
+    def _wait(self) -> None:
+        poller = select.poll()
+        poller.register(self._arrivals.fileno(), select.POLLIN)
+        timeout = None
+        if self._item is None:
+            poller.register(self._inbox.fileno(), select.POLLIN)
+            timeout = local.LOOK_AGAIN * 1000
+        else:
+            for reader in self._readers:
+                poller.register(reader.fileno(), reader.room_events)
+        poller.poll(timeout)
+
+    def _welcome(self) -> None:
+        message = self._arrivals.try_recv()
+        if message is None:
+            return
+        try:
+            answer: Channel = packet.loads(message)
+        except Exception:  # the reader is gone already
+            return
+        theirs, ours = local.one_way_pair()
+        with collecting_grants(reusable=False) as grants:
+            invitation = pickle.dumps(theirs)
+        try:
+            answer.send(invitation)
+            answer.recv().release()  # it has it
+            self._readers.append(ours)
+        except (OSError, ConnectionClosed):
+            ours.close()
+        finally:
+            grants.release()
+            theirs.close()
+            answer.close()
+
+    def _deal(self, item: Message) -> bool:
+        """Deal an item to a reader with room; return False if there was none."""
+        for _ in range(len(self._readers)):
+            reader = self._readers.popleft()
+            try:
+                dealt = reader.try_send(item.payload, item.buffers)
+            except BrokenPipeError:  # it is gone
+                reader.close()
+                continue
+            self._readers.append(reader)
+            if dealt:
+                return True
+        return False
+
+
+def arrive(arrivals: Channel) -> Channel:
+    """Become a reader: the channel on which the dealer sends.  ConnectionClosed if it is gone."""
+    ours, theirs = LocalChannel.pair()
+    with collecting_grants(reusable=False) as grants:
+        invitation = pickle.dumps(theirs)
+    theirs.close()
+    try:
+        arrivals.send(invitation)
+        while not ours.poll(_LOOK_AGAIN):
+            if arrivals.poll(0):  # nothing ever comes there but the end
+                raise ConnectionClosed()
+        channel: Channel = ours.recv_object()
+        if isinstance(channel, RemoteObject):  # or the grant might be taken back before
+            channel.confirm()
+        ours.send(b"")
+        return channel
+    except BrokenPipeError as error:
+        raise ConnectionClosed() from error
+    finally:
+        grants.release()
+        ours.close()

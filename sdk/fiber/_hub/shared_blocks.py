@@ -1,0 +1,346 @@
+"""Objects that are blocks of shared memory, and their way into processes of any host.
+
+* A ``SharedBuffer`` is memory for a user's object.  On the host where it was made, every process
+  has the memory itself.  Another host has a replica, which its hub keeps in step
+  (``fiber._hub.replicas``).
+* A semaphore of another host is a ``RemoteSemaphore``.  The hub there holds tokens for this
+  process, and a stream keeps each token.  The hub gives the token back when the stream ends, and
+  the kernel ends the stream when this process dies.
+* A wait list of another host is a ``RemoteWaitList``.  A stream keeps each place in it.
+"""
+
+from __future__ import annotations
+
+import copyreg
+import os
+import threading
+import weakref
+from contextlib import suppress
+from multiprocessing import current_process
+from typing import Any, TypeAlias
+
+from fiber._hub import client, heap
+from fiber._hub.client import HubStream, ObjectUnreachable
+from fiber._hub.handles import (
+    BlockHandle,
+    HubHandle,
+    handle_for_block,
+    handle_for_remote_block,
+    ring,
+)
+from fiber._hub.heap import Block, block_of
+from fiber._hub.protocol import ONE, SECRET, TWO, Extent, ObjectKind, Op, Origin, Status
+from fiber._hub.remote import RemoteCounter, RemoteObject
+from fiber._sync.semaphore import RECURSIVE, SEMAPHORE_SIZE, Abandoned, SharedSemaphore
+from fiber._sync.wait_list import WAIT_LIST_SIZE, WaitList
+from fiber._wire.descriptor import own
+
+# Buffers
+
+
+class SharedBuffer:
+    """Some bytes of shared memory, zero at first."""
+
+    __slots__ = ("__weakref__", "_block")
+
+    def __init__(self, block: Block) -> None:
+        self._block = block
+
+    @property
+    def view(self) -> memoryview:
+        """The bytes; to be used while this object is kept."""
+        return self._block.view
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _rebuild_buffer, (handle_for_block(ObjectKind.MEMORY, self._block),)
+
+
+class ReplicaBuffer(SharedBuffer):
+    """The same on another host than where it was made."""
+
+    __slots__ = ("_extent", "_original", "_stream")
+
+    def __init__(self, home: HubHandle, extent: Extent) -> None:
+        self._extent = extent
+        # Keeps the original at its home.
+        original = self._original = RemoteObject(*home)
+        # Keeps the replica at this host's hub, until this object is forgotten.
+        self._stream = HubStream(client.hub_address())
+        address, grant, identity = home
+        origin = Origin(address.host, identity, extent.size, original.token, grant)
+        reply = self._stream.ask(Op.REPLICATE, buffers=[memoryview(origin.encode())])
+        (fd,), (offset,) = reply.fds, reply.values
+        super().__init__(block_of(own(fd), offset, extent.size))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _rebuild_buffer, (handle_for_remote_block(self._original, self._extent),)
+
+
+def create_buffer(size: int) -> SharedBuffer:
+    """A new one."""
+    return SharedBuffer(heap.allocate(size))
+
+
+def _rebuild_buffer(handle: BlockHandle) -> SharedBuffer:
+    home = handle.elsewhere()
+    if home is None:
+        return SharedBuffer(handle.block())
+    return ReplicaBuffer(home, handle.extent)
+
+
+# Locks and semaphores
+
+
+class RemoteSemaphore(RemoteObject):
+    """Semaphore of another host, with the methods of multiprocessing's ``SemLock``."""
+
+    def __init__(self, handle: HubHandle, extent: Extent, kind: int, maximum: int) -> None:
+        self.extent = extent
+        self.kind = kind
+        self.maximum = maximum
+        self._holding: list[HubStream] = []
+        self._owner: int | None = None
+        self._depth = 0
+        super().__init__(*handle)
+
+    def acquire(self, block: bool = True, timeout: float | None = None) -> bool | Abandoned:
+        """Take a token; False if there is none, nor within ``timeout`` seconds."""
+        if self.kind == RECURSIVE and self._is_mine():
+            self._depth += 1
+            return True
+        stream = self._pop(self._idle)
+        try:
+            stream.settle()
+            name = memoryview(self._name().encode())
+            reply = stream.ask(Op.ACQUIRE, timeout=timeout if block else 0, buffers=[name])
+        except ObjectUnreachable:
+            self._idle.append(stream)
+            raise
+        except BaseException:
+            stream.give_up(Op.ACQUIRE)
+            self._idle.append(stream)
+            raise
+        if reply.status is not Status.OK:
+            self._idle.append(stream)
+            return False
+        self._owner = threading.get_ident()
+        self._depth = 1 if self.kind == RECURSIVE else self._depth + 1
+        (is_kept,) = reply.values
+        (self._holding if is_kept else self._idle).append(stream)
+        return Abandoned(str(reply.parts[0], "utf-8", "replace")) if reply.parts else True
+
+    def release(self) -> None:
+        """Give a token back; ValueError if there are as many as there can be.
+
+        AssertionError if it is recursive and this thread has not acquired it.
+        """
+        if self.kind == RECURSIVE:
+            if not self._is_mine():
+                raise AssertionError("attempt to release recursive lock not owned by thread")
+            if self._depth > 1:
+                self._depth -= 1
+                return
+        self._check()
+        if not self._holding:
+            with self.stream() as stream:
+                self._give(stream)
+            return
+        stream = self._holding.pop()
+        try:
+            self._give(stream)
+        finally:
+            self._idle.append(stream)
+
+    def _is_mine(self) -> bool:
+        """Tell whether this thread was the last of this process to acquire it, and holds it."""
+        return self._depth > 0 and self._owner == threading.get_ident()
+
+    def _count(self) -> int:
+        """Return how often this process has acquired it and not released it."""
+        return self._depth
+
+    def _get_value(self) -> int:
+        """Return how often it can be acquired now."""
+        with self.stream() as stream:
+            value: int = stream.ask(Op.TOKENS).values[0]
+        return value
+
+    def _is_zero(self) -> bool:
+        """Tell whether it cannot be acquired now."""
+        return not self._get_value()
+
+    def close(self) -> None:
+        """Let go of it, and of what this process has of it."""
+        super().close()
+        self._holding.clear()
+
+    def _give(self, stream: HubStream) -> None:
+        self._depth -= 1  # before another thread can have it
+        if stream.ask(Op.POST).status is Status.NO:
+            self._depth += 1
+            raise ValueError("semaphore or lock released too many times")
+
+    def _forked(self) -> None:
+        super()._forked()
+        self._holding.clear()
+        self._owner, self._depth = None, 0
+
+    def _name(self) -> str:
+        return f"{current_process().name} (pid {os.getpid()} on {client.host()})"
+
+
+AnySemaphore: TypeAlias = SharedSemaphore | RemoteSemaphore
+
+# One object for each in a process: only so a recursive one knows its thread again, however often it
+# was unpickled.  By the identity of its block, or by the one that its hub elsewhere gave it.
+_semaphores: weakref.WeakValueDictionary[tuple[object, ...], AnySemaphore] = (
+    weakref.WeakValueDictionary()
+)
+
+
+def create_semaphore(kind: int, value: int, maximum: int) -> SharedSemaphore:
+    """A new one, with ``value`` of at most ``maximum`` tokens."""
+    block = heap.allocate(SEMAPHORE_SIZE)
+    new = _semaphores[block.identity] = SharedSemaphore.create(block, kind, value, maximum, ring)
+    return new
+
+
+def _rebuild_semaphore(handle: BlockHandle, kind: int, maximum: int) -> AnySemaphore:
+    home = handle.elsewhere()
+    if home is not None:
+        remote = RemoteSemaphore(home, handle.extent, kind, maximum)
+        return _semaphores.setdefault((home.identity,), remote)
+    block = handle.block()
+    known = _semaphores.get(block.identity)
+    if known is None:
+        known = _semaphores.setdefault(block.identity, SharedSemaphore(block, kind, ring))
+    return known
+
+
+def _reduce_semaphore(semaphore: SharedSemaphore) -> tuple[Any, ...]:
+    assert isinstance(semaphore.block, heap.Block)
+    handle = handle_for_block(ObjectKind.SEMAPHORE, semaphore.block)
+    return _rebuild_semaphore, (handle, semaphore.kind, semaphore.maximum)
+
+
+def _reduce_remote_semaphore(remote: RemoteSemaphore) -> tuple[Any, ...]:
+    handle = handle_for_remote_block(remote, remote.extent)
+    return _rebuild_semaphore, (handle, remote.kind, remote.maximum)
+
+
+copyreg.pickle(SharedSemaphore, _reduce_semaphore)
+copyreg.pickle(RemoteSemaphore, _reduce_remote_semaphore)
+
+
+# Wait lists of conditions
+
+
+class RemoteWaitList(RemoteObject):
+    """Wait list of another host.  A place is a stream, so it ends with this process."""
+
+    def __init__(self, handle: HubHandle, extent: Extent) -> None:
+        self.extent = extent
+        super().__init__(*handle)
+
+    def enter(self) -> HubStream:
+        """A place for this thread."""
+        stream = self._pop(self._idle)
+        try:
+            stream.settle()
+            stream.ask(Op.ENTER)
+        except BaseException:
+            with suppress(OSError, ObjectUnreachable):
+                stream.say(Op.LEAVE)
+            self._idle.append(stream)
+            raise
+        return stream
+
+    def sleep(self, place: HubStream, timeout: float | None) -> None:
+        """Wait until that place is notified, for ``timeout`` seconds at most.  Without the lock."""
+        place.ask(Op.SLEEP, timeout=timeout)
+
+    def leave(self, place: HubStream) -> bool:
+        """Free a place; return whether it was notified."""
+        place.settle()
+        notified = place.ask(Op.LEAVE).status is Status.OK
+        self._idle.append(place)
+        return notified
+
+    def dismiss(self, place: HubStream) -> None:
+        """Free a place that was taken for longer.  Waits for nothing, and needs no hub."""
+        with suppress(OSError, ObjectUnreachable):
+            place.say(Op.LEAVE)
+        place.close()
+
+    def notify(self, n: int) -> None:
+        """Wake the ``n`` that have waited for longest; who died meanwhile is passed over."""
+        self._ask(Op.NOTIFY, n)
+
+    def waiters(self) -> int:
+        """Return the number of waiters."""
+        return self._ask(Op.WAITERS, 0)
+
+    def bury(self) -> int:
+        """Return how many waiters died since the last call."""
+        return self._ask(Op.BURY, 0)
+
+    def hold(self, place: HubStream, number: int) -> None:
+        """Note how many things the owner of a place has.  Waits for nothing."""
+        place.say(Op.HOLD, number, form=ONE)
+
+    def tally(self, place: HubStream, held: int, total: int) -> None:
+        """Note how many things the owner of a place has, and set the user's second word."""
+        place.ask(Op.TALLY, held, total, form=TWO)
+
+    def held(self) -> int:
+        """Return the number of things that all owners of places have."""
+        return self._ask(Op.HELD, 0)
+
+    def reclaim(self, counter: RemoteCounter) -> int:
+        """Free the places of dead processes; give ``counter`` what they had and return it."""
+        with self.stream() as stream:
+            value: int = stream.ask(Op.RECLAIM, counter.known(), form=SECRET).values[0]
+        return value
+
+    def get(self, number: int) -> int:
+        """Return one of the user's two words."""
+        value = self._ask(Op.GET, number)
+        return value - (1 << 64) if value >> 63 else value
+
+    def set(self, number: int, value: int) -> None:
+        """Set it."""
+        with self.stream() as stream:
+            stream.ask(Op.SET, number, value & ((1 << 64) - 1), form=TWO)
+
+    def _ask(self, operation: Op, number: int) -> int:
+        with self.stream() as stream:
+            value: int = stream.ask(operation, number, form=ONE).values[0]
+        return value
+
+
+AnyWaitList: TypeAlias = WaitList | RemoteWaitList
+
+
+def create_wait_list() -> WaitList:
+    """A new one, with nobody in it."""
+    return WaitList(heap.allocate(WAIT_LIST_SIZE), ring)
+
+
+def _rebuild_wait_list(handle: BlockHandle) -> AnyWaitList:
+    home = handle.elsewhere()
+    if home is not None:
+        return RemoteWaitList(home, handle.extent)
+    return WaitList(handle.block(), ring)
+
+
+def _reduce_wait_list(waiters: WaitList) -> tuple[Any, ...]:
+    assert isinstance(waiters.block, heap.Block)
+    return _rebuild_wait_list, (handle_for_block(ObjectKind.WAIT_LIST, waiters.block),)
+
+
+def _reduce_remote_wait_list(remote: RemoteWaitList) -> tuple[Any, ...]:
+    return _rebuild_wait_list, (handle_for_remote_block(remote, remote.extent),)
+
+
+copyreg.pickle(WaitList, _reduce_wait_list)
+copyreg.pickle(RemoteWaitList, _reduce_remote_wait_list)
