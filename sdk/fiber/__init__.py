@@ -230,7 +230,7 @@ _HOMES = {
 if not TYPE_CHECKING:  # a type checker would accept any name
 
     def __getattr__(name: str) -> object:
-        """Names are looked up when first used, so that importing Fiber costs nothing."""
+        """Look up a name at its first use, so that ``import fiber`` is fast."""
         _tell_where_it_started()
         if name in _HOMES:
             value = getattr(importlib.import_module(f"fiber.{_HOMES[name]}"), name)
@@ -256,9 +256,10 @@ _started_in = None if "multiprocessing.process" in sys.modules else _working_dir
 
 
 def _tell_where_it_started() -> None:
-    """Have multiprocessing know this directory, which it reads as late as it is imported.
+    """Tell multiprocessing the directory in which the program imported Fiber.
 
-    Relative paths of modules and of the main file are relative to it, wherever the program is now.
+    multiprocessing is imported later, when the program may have changed its directory.  Relative
+    paths of modules and of the main file are relative to this one.
     """
     global _started_in
     if _started_in is not None:
@@ -272,7 +273,7 @@ def __dir__() -> list[str]:
 
 
 def _find_foreign_files() -> None:
-    """Warn if another distribution has installed its modules among these."""
+    """Warn if another distribution has installed modules in this package."""
     try:
         names = os.listdir(__path__[0])
     except OSError:  # an archive

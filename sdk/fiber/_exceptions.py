@@ -1,4 +1,4 @@
-"""Exceptions that are stored and raised later, or that no caller catches."""
+"""Copies of stored exceptions, and reports of exceptions that no caller catches."""
 
 from __future__ import annotations
 
@@ -86,12 +86,12 @@ def make(kind: type[_E], group: tuple[Any, ...]) -> _E:
 
 
 def group_of(error: BaseException) -> tuple[Any, ...]:
-    """Return what a group is made with: other fields can be set later."""
+    """Return the arguments that make a group: its other fields can be set later."""
     return (error.message, error.exceptions) if isinstance(error, BaseExceptionGroup) else ()
 
 
 def fields_of(error: BaseException) -> dict[str, Any]:
-    """Return what is not in the instance's dictionary: slots, and what native code keeps."""
+    """Return the fields outside of the instance's dictionary: slots, and those of native code."""
     found: dict[str, Any] = {}
     for field in _fields(type(error)):
         value = _value(field, error)
@@ -127,7 +127,7 @@ def _value(field: Any, error: BaseException) -> Any:
 
 
 def _fields(kind: type[BaseException]) -> tuple[Any, ...]:
-    """List the descriptors of what is not in the instance's dictionary."""
+    """Yield the descriptors of the fields outside of the instance's dictionary."""
     fields = _known_fields.get(kind)
     if fields is None:
         _known_fields[kind] = fields = tuple(
@@ -144,10 +144,10 @@ _known_fields: WeakKeyDictionary[type, tuple[Any, ...]] = WeakKeyDictionary()
 
 
 def report_uncaught() -> None:
-    """Pass the exception being handled to ``sys.excepthook``, on a thread that has to go on.
+    """Pass the current exception to ``sys.excepthook``, on a thread that must go on.
 
-    The hook is the program's.  If it raises, the interpreter's own hook shows both exceptions.  If
-    it calls ``sys.exit()``, that has no effect, as on every thread but the main one.
+    The hook is the program's.  If it raises, the interpreter's hook shows both exceptions.  If it
+    calls ``sys.exit()``, that has no effect, as on every thread but the main one.
     """
     try:
         sys.excepthook(*sys.exc_info())

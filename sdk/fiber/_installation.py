@@ -1,6 +1,6 @@
 """Faults of an installation: packages that are missing, files of another distribution.
 
-Imported where there may be a fault, and not by ``import fiber`` of a good installation.
+It is imported only where a fault is possible, and not by ``import fiber`` of a good installation.
 """
 
 from __future__ import annotations

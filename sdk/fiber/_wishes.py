@@ -1,4 +1,4 @@
-"""Wishes for a process as people write them, read into values that compare and hash.
+"""Readers of wishes for a process: from the form that users write to values that hash.
 
 ``fiber.meta``, the options of an executor and the configuration share these readers. Each raises
 ValueError for a value that it cannot read.

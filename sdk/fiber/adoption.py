@@ -1,11 +1,10 @@
-"""`fiber.adopt`: run a library that was written for multiprocessing, and cannot be edited.
+"""`fiber.adopt`: run a library that was written for multiprocessing and that you cannot edit.
 
-A function finds its globals in the namespace of its module at each call, so rebinding the
-names there is enough, and touches no other module. The same is done with default values of the
-module's functions and with attributes of its classes. What else Python evaluated when the module
-was imported (base classes, objects that were made then) is out of reach. It is looked for and
-refused, where it belongs to a class or function of the module or to the module itself; inside of
-containers and closures it is not found.
+A function looks up its globals in the namespace of its module at each call. So it is enough to
+rebind the names there, and no other module changes. Default values of the module's functions and
+attributes of its classes are rebound, too. Other objects that Python evaluated when the module was
+imported, such as base classes, cannot be rebound. They are refused if they belong to the module, or
+to one of its classes or functions. Inside of containers and closures they are not found.
 """
 
 from __future__ import annotations
@@ -28,17 +27,16 @@ __all__ = ["Adoption", "adopt"]
 
 
 def adopt(module: str | ModuleType) -> Adoption:
-    """Rebind what one module took from multiprocessing to Fiber's equivalents.
+    """Rebind the names that one module took from multiprocessing to Fiber's equivalents.
 
-    `module` is a module or its name, which is imported if need be. Every name in it that is
-    bound to the multiprocessing package, one of its submodules, or a class, function or
-    context from there is bound to what Fiber has in its place. So are default values of its
-    functions and attributes of its classes. All or nothing: if one has no equivalent,
-    AdoptionError says which and the module is left as it was. Adopting a module again changes
-    nothing more.
+    `module` is a module or its name, which is imported if necessary. Names that are bound to
+    the multiprocessing package, to one of its submodules, or to its classes, functions and
+    contexts are bound to Fiber's. So are default values of its functions and attributes of its
+    classes. If one has no equivalent, AdoptionError names it, and the module stays unchanged.
+    Adopting a module again has no further effect.
 
-    The effect lasts as long as the program, or, used as a context manager, until the block
-    ends. It is this process's: a child that imports the module anew has the original.
+    The effect lasts until the program ends. As a context manager, it lasts until the block ends.
+    It holds in this process: a child that imports the module again has the original.
     """
     return Adoption(_resolve(module), importlib.import_module("fiber"))
 
@@ -54,8 +52,9 @@ class Adoption:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names in the module that are bound to Fiber's objects now, and of default values
-        and class attributes where they are: `start.context`, `Worker.make_queue`.
+        """Names in the module that are bound to Fiber's objects now.
+
+        Default values and class attributes have dotted names: `start.context`, `Worker.queue`.
         """
         with _lock:
             state = _adopted.get(self.module)
@@ -100,23 +99,23 @@ class Adoption:
                 return
             del _adopted[self.module]
             for place, binding in state.bindings.items():
-                # What somebody else has bound since is theirs.
+                # A name that other code has bound since stays.
                 if place.read(self.module) is binding.new:
                     place.write(self.module, binding.old)
 
 
 class _Reference(Protocol):
-    """Something of a module that refers to an object; it does not refer to the module."""
+    """Name, default value or attribute of a module.  It does not refer to the module itself."""
 
     @property
     def name(self) -> str:
         """Name under which the module's code uses the object."""
 
     def read(self, module: ModuleType) -> object:
-        """Return what it refers to now."""
+        """Return the object to which it refers now."""
 
     def write(self, module: ModuleType, value: object) -> None:
-        """Have it refer to ``value``."""
+        """Make it refer to ``value``."""
 
 
 @dataclass(frozen=True)
@@ -218,7 +217,7 @@ def _resolve(module: str | ModuleType) -> ModuleType:
 
 
 def _plan(module: ModuleType, fiber: Any, *, adopted: bool) -> dict[_Reference, _Binding]:
-    """Return what to rebind in the module; AdoptionError with everything that is in the way."""
+    """Return the names to rebind in the module; AdoptionError with all problems."""
     survey = _Survey(module, fiber)
     if survey.problems:
         raise AdoptionError(_refusal(module, survey.problems))
@@ -243,8 +242,9 @@ class _Survey:
     def _take(
         self, place: _Reference, value: object, what: str, around: type[Any] | None = None
     ) -> bool:
-        """Plan to rebind a place whose ``value``, inside of ``around``, was taken from
-        multiprocessing; False if it was not.
+        """Plan to rebind a name whose ``value``, inside of ``around``, is multiprocessing's.
+
+        Return False if the value is not from multiprocessing.
         """
         if not (taken := _taken(value)):
             return False
@@ -260,7 +260,7 @@ class _Survey:
         return True
 
     def _look_into(self, name: str, value: object) -> None:
-        """Look for what was decided when the module was imported."""
+        """Look for multiprocessing's objects that were evaluated at the import."""
         if isinstance(value, FunctionType):
             if value.__module__ == self._module.__name__:
                 self._look_into_function(name, value)
@@ -296,7 +296,7 @@ class _Survey:
         for parameter, value in (function.__kwdefaults__ or {}).items():
             place = _KeywordDefault(f"{name}.{parameter}", function, parameter)
             self._take_default(name, place, value)
-        wrapped = getattr(function, "__wrapped__", None)  # a decorator's, as singledispatch's
+        wrapped = getattr(function, "__wrapped__", None)  # of a decorator, as singledispatch
         if isinstance(wrapped, FunctionType) and wrapped.__module__ == self._module.__name__:
             self._look_into_function(name, wrapped)
 
@@ -307,7 +307,7 @@ class _Survey:
 
 
 def _rebind(module: ModuleType, bindings: dict[_Reference, _Binding]) -> None:
-    """Rebind all places or, where one cannot be written to, none."""
+    """Rebind all names or, if one cannot be written to, none."""
     done: list[_Reference] = []
     try:
         for place, binding in bindings.items():
@@ -321,7 +321,7 @@ def _rebind(module: ModuleType, bindings: dict[_Reference, _Binding]) -> None:
 
 
 def _taken(value: object) -> str | None:
-    """The full name of what was taken from multiprocessing; None if the value was not."""
+    """Return the full name of a value of multiprocessing's; None for other values."""
     match value:
         case ModuleType():
             origin = value.__name__
@@ -335,14 +335,14 @@ def _taken(value: object) -> str | None:
         case _:
             return None
     top, _, rest = origin.partition(".")
-    # multiprocessing.dummy is about threads, which need nothing from Fiber.
+    # multiprocessing.dummy is about threads, which work without Fiber.
     is_taken = top == "multiprocessing" and rest.partition(".")[0] != "dummy"
     return origin if is_taken else None
 
 
 def _context_name(context: BaseContext) -> str | None:
     if not _taken(type(context)):
-        return None  # Fiber's, or somebody's own
+        return None  # Fiber's, or the user's
     method = _start_method(context)
     return f"multiprocessing.get_context({method!r})" if method else "multiprocessing"
 
@@ -352,7 +352,7 @@ def _start_method(context: BaseContext) -> str | None:
 
 
 def _equivalent(value: Any, taken: str, fiber: Any) -> object:
-    """Return what Fiber has in place of the value; LookupError if it has nothing."""
+    """Return Fiber's equivalent of the value; LookupError if there is none."""
     try:
         if isinstance(value, BaseContext):
             return fiber.get_context(_start_method(value))
@@ -360,7 +360,7 @@ def _equivalent(value: Any, taken: str, fiber: Any) -> object:
             context: Any = value.__self__
             method = _start_method(context)
             return getattr(fiber.get_context(method) if method else fiber, value.__name__)
-        # Process lives in multiprocessing.context, but everybody knows it by this name.
+        # Process is defined in multiprocessing.context, but its usual name is this one.
         if not isinstance(value, ModuleType):
             name = value.__name__
             if getattr(multiprocessing, name, None) is value:
@@ -379,7 +379,7 @@ def _is_shared(value: object, taken: str, fiber: Any) -> bool:
 
 
 def _leftover(value: object, fiber: Any) -> str | None:
-    """Return the name of what stays multiprocessing's in the module; None if nothing does."""
+    """Return the name of an object that would stay multiprocessing's; None for other objects."""
     if taken := _taken(value):
         return None if _is_shared(value, taken, fiber) else taken
     kind = type(value)
@@ -396,10 +396,9 @@ def _refusal(module: ModuleType, problems: list[str]) -> str:
     lines = "".join(f"\n  - {problem}" for problem in problems)
     return (
         f"cannot adopt {module.__name__!r}, which was left as it is:{lines}\n"
-        "fiber.adopt() can only rebind names, default values and class attributes to what Fiber "
-        "has. What to do: put "
-        "something of your own in these places before it, which will be left alone, or let "
-        "the module stay on multiprocessing."
+        "fiber.adopt() can only rebind names, default values and class attributes to Fiber's "
+        "equivalents. Replace these objects by your own before you call it, or let the module "
+        "stay on multiprocessing."
     )
 
 
@@ -415,5 +414,5 @@ def _nothing_taken(module: ModuleType) -> str:
     hint = f" These modules inside of it do: {', '.join(inside)}." if inside else ""
     return (
         f"cannot adopt {module.__name__!r}: none of its names comes from multiprocessing. "
-        f"Name the very module that imports it.{hint}"
+        f"Name the module that imports it.{hint}"
     )

@@ -2,11 +2,11 @@
 
 From the weakest source to the strongest: defaults, `[tool.fiber]` in the nearest
 pyproject.toml upward from the working directory, environment variables (`FIBER_BACKEND` for
-`backend`, and so on), `fiber.init()`. All four know the same keys, those of `Config`. A key
-that does not exist and a value that does not fit are a ConfigError wherever they come from.
+`backend`, and so on), `fiber.init()`. All four have the same keys, those of `Config`. An
+unknown key or a value that does not fit raises ConfigError, with its source.
 
-Some variables `FIBER_AGENT_*` are not configuration: an agent is told by them where its master
-is, and what belongs to it (see `fiber.agent`).
+Variables `FIBER_AGENT_*` are not configuration: backends and pods set them for agents (see
+`fiber.agent`).
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class _Rule(NamedTuple):
     check: Callable[[object], object]
     from_text: Callable[[str], object] = str
     is_path: bool = False
-    """True if a text is a path, relative to the folder of the file that it stands in."""
+    """True if a text is a path, relative to the folder of the file that has it."""
 
 
 def _choice(*choices: str) -> _Rule:
@@ -96,7 +96,7 @@ def _word(expects: str, pattern: str = r"\S+") -> _Rule:
 
 def _pool() -> _Rule:
     def check(value: object) -> str:
-        from fiber_api import names  # needed by programs on Kubernetes alone
+        from fiber_api import names  # only programs on Kubernetes need it
 
         if not isinstance(value, str):
             raise ValueError
@@ -111,7 +111,7 @@ def _template() -> _Rule:
             return copy.deepcopy(dict(value))
         if not isinstance(value, str | os.PathLike) or not os.fspath(value):
             raise ValueError
-        # Read later: a program that runs nothing on Kubernetes does not need the file.
+        # The file is read later: only programs on Kubernetes need it.
         return os.path.abspath(os.fsdecode(value))
 
     expects = "the path of a YAML or JSON file with a pod template, or a dict of one"
@@ -161,7 +161,7 @@ _LABEL = "[a-z0-9]([-a-z0-9]{0,61}[a-z0-9])?"
 
 
 def _key(default: Any, rule: _Rule, *, fixed: bool = False) -> Any:
-    """A key of Config; `fixed`: read once, when the runtime starts."""
+    """Return the field of a key; `fixed`: read once, when the runtime starts."""
     return field(default=default, metadata={"rule": rule, "fixed": fixed})
 
 
@@ -174,64 +174,63 @@ class Config:
     """Configuration of a program.  The signature has the type and default of each key.
 
     Keys marked * are read when the first process, pool, pipe, queue, event or semaphore is
-    made, and cannot change after that; the others hold for what is made next.
+    made, and cannot change after that. The others hold for objects that are made next.
 
-    A key whose default is None takes None too, as if it were not given.
+    A key whose default is None accepts None, as if it were not given.
 
     backend*: where processes run. "local" starts them on this machine as children of the
-        program. "loopback" does the same through agents, separate processes that reach the
-        program over encrypted nng links, as they would on other machines. "kubernetes" runs
-        them in pods, which Fiber's operator makes. "auto" is "kubernetes" in a pod whose
-        service account may create FiberPools, if the cluster knows these and the operator of
-        the namespace is not gone, and "local" everywhere else.
-    agents*: how many agents the loopback backend starts.
-    processes_per_agent*: how many processes one agent runs at most, a further one being a
-        StartError when all agents are full; 0 means no limit.
+        program. "loopback" starts them under agents, separate processes with encrypted nng
+        links to the program, as on other machines. "kubernetes" runs them in pods, which
+        Fiber's operator makes. "auto" is "kubernetes" in a pod whose service account may
+        create FiberPools, if the cluster has this resource and a living operator for the
+        namespace, and "local" everywhere else.
+    agents*: number of agents that the loopback backend starts.
+    processes_per_agent*: largest number of processes of one agent. When all agents are full,
+        starting a process raises StartError. 0 means no limit.
     namespace*: the Kubernetes namespace of the program's FiberPools; None means the kubeconfig
         context's, or in a pod the pod's own.
     context*: the context of the kubeconfig to use; None means the current one, or in a pod the
         pod's service account.
     image*: the image that workers run; None means in a pod the program's own, elsewhere
         Fiber's worker image of this version.
-    template*: what pods of workers have beyond that, and in place of it: a pod template as in
-        a Deployment ({"spec": …}), or the path of a YAML or JSON file with one, merged over
-        what Fiber makes as kubectl would, containers by their names. The container that runs
-        the processes is called "worker".
-    pool*: the name of a FiberPool that is there already, to use instead of making one.
-    processes_per_pod*: how many processes one pod runs; it asks for as many times what
-        `fiber.meta` says that each needs.
-    cpu_request*: CPUs that one process requests if `fiber.meta` says nothing about them, as
-        there: 0.5 or "500m"; 0 requests none.
+    template*: additions and changes to the pods of workers: a pod template as in a Deployment
+        ({"spec": …}), or the path of a YAML or JSON file with one. It is merged over Fiber's
+        template as kubectl would do it, containers by their names. The container that runs the
+        processes is called "worker".
+    pool*: the name of an existing FiberPool to use instead of making one.
+    processes_per_pod*: number of processes of one pod. The pod requests as many times the
+        resources that `fiber.meta` wishes for each.
+    cpu_request*: CPUs that one process requests without a wish of `fiber.meta`, in the same
+        form: 0.5 or "500m"; 0 requests none.
     memory_request*: memory, likewise: 512 or "512Mi"; 0 requests none.
-    shm*: the size of /dev/shm in each pod, as 2048 or "2Gi". It is memory of the pod: the
-        pod's request and limit of memory are larger by it. None means what the container
-        runtime gives, mostly 64 MiB.
+    shm*: the size of /dev/shm in each pod, as 2048 or "2Gi". It is added to the pod's request
+        and limit of memory. None means the container runtime's default, mostly 64 MiB.
     node_selector*: labels of the nodes of all pods, as in `fiber.meta`, which adds to them.
     tolerations*: taints that these nodes may have, likewise.
-    max_pods*: how many pods one FiberPool of the program may have at most.
-    pod_timeout*: seconds that the first pod may take to come, its image included; then the wait
-        for it is an error.
-    idle_timeout*: seconds after which a pod that runs nothing is let go.
-    listen_host*: the address at which the program listens for agents; None means the loopback
-        address for agents on this machine, and for pods the one that they reach it at, which
-        is found.
-    listen_port*: the port for it, for all agents of the program; 0 takes one that is free, and a
-        range such as "9000-9009" the first that is free, for several programs on one host.
-    advertised_host*: the address that pods dial where it is not the one above, as behind NAT or
-        port forwarding; the port is the same. None means the address that is listened at.
+    max_pods*: largest number of pods of one FiberPool of the program.
+    pod_timeout*: seconds within which the first pod must start, with the download of its image;
+        otherwise the wait for it ends with an error.
+    idle_timeout*: seconds after which an idle pod is released.
+    listen_host*: the address at which the program listens for agents. None means the loopback
+        address for agents on this machine. For pods it means the address at which they reach
+        the program, which Fiber finds out.
+    listen_port*: the port at this address, for all agents of the program. 0 takes a free port.
+        A range such as "9000-9009" takes the first free one: for several programs on one host.
+    advertised_host*: the address that pods dial if it is not the one above, as behind NAT or
+        port forwarding. The port is the same. None means the address above.
     start_timeout: seconds that a process or an agent may take to start.
-    heartbeat_interval*: seconds between two signs of life of an agent.
+    heartbeat_interval*: seconds between two heartbeats of an agent.
     suspect_after*: seconds of silence after which an agent gets no new work.
     lost_after*: seconds of silence after which an agent counts as lost, and its tasks run
         elsewhere.
     retries: how many times a task runs again after its worker died.
     disruptions: how many times a task runs again after the cluster ended its worker, as by a drain
-        or an eviction; that uses up no retry.  Where `retries` is 0 no task runs twice.  It is also
-        how often in a row the environments of a vector environment are made anew for that reason.
-    log_level: the least severe records that are shown on stderr, in children too, as by
-        `fiber.log_to_stderr()`. "DEBUG" shows workers, processes, agents and links come and go.
-    runtime_directory*: where Fiber makes its private directory for sockets and credentials;
-        None means `tempfile.gettempdir()`. Socket paths are short: so should this be.
+        or an eviction. That uses up no retry. If `retries` is 0, no task runs twice. It also bounds
+        how often in a row a vector environment makes its environments again for that reason.
+    log_level: the least severe level that is shown on stderr, in children, too, as by
+        `fiber.log_to_stderr()`. "DEBUG" shows each start and end of workers, agents and links.
+    runtime_directory*: where Fiber makes its private directory for sockets and credentials.
+        None means `tempfile.gettempdir()`. Choose a short path: paths of sockets have a limit.
     """
 
     backend: Backend = _key("auto", _choice(*get_args(Backend)), fixed=True)  # noqa: RUF009 - a field
@@ -316,15 +315,15 @@ def _not_in_use() -> bool:
     return False
 
 
-# One configuration, or none yet.  No lock: a signal handler that makes a pipe while its own thread
-# reads the sources would wait for it for ever.  Of several that read them, the first counts.
+# One configuration, or none yet.  No lock: if a signal handler makes a pipe while its thread reads
+# the sources, it would wait for itself.  If several threads read the sources, the first one counts.
 _current: dict[str, Config] = {}
 _in_use: Callable[[], bool] = _not_in_use
-_used = False  # something that is no part of the runtime was built on it, such as a pipe
+_used = False  # True once an object outside of the runtime, such as a pipe, depends on it
 
 
 def current() -> Config:
-    """The configuration in force: at the first call read from its sources, or a parent's."""
+    """Return the configuration in force.  The first call reads the sources, or the parent's."""
     config = _current.get("config")
     if config is None:
         pickled = _config_sources.configuration()
@@ -334,7 +333,7 @@ def current() -> Config:
 
 
 def use() -> Config:
-    """`current()`, for something that is built on it: a later `init()` respects that."""
+    """Return `current()` for an object that depends on it: a later `init()` respects that."""
     global _used
     config = current()
     _used = True
@@ -344,9 +343,9 @@ def use() -> Config:
 def init(**settings: Unpack[ConfigKeywords]) -> Config:
     """Set keys of `Config` for this program, and return the configuration that results.
 
-    Each call starts anew from the other sources: keys of an earlier call are forgotten.
-    Comes before the first process, pool, pipe or queue: a later call may not change a key
-    that the running program was built on.
+    Each call starts again from the other sources: keys of an earlier call are forgotten. Call
+    it before the first process, pool, pipe or queue. A later call may not change the keys that
+    are marked * in `Config`.
     """
     global _current
     config = load(settings)
@@ -369,13 +368,13 @@ def assign(key: str, value: object) -> None:
 
 
 def install(config: Config) -> None:
-    """Put a configuration in force as it is."""
+    """Put a configuration in force, unchecked."""
     global _current, _used
     _current, _used = {"config": config}, False
 
 
 def guard(in_use: Callable[[], bool]) -> None:
-    """Let the runtime say whether it has been built on `current()`, which `init()` respects."""
+    """Set the function that says whether the runtime uses `current()`, which `init()` respects."""
     global _in_use
     _in_use = in_use
 
@@ -401,7 +400,7 @@ class _Setting(NamedTuple):
     source: str
     spelling: Callable[[str], str] = str  # how a key is written in this kind of source
     is_text: bool = False
-    folder: str = ""  # that of the file that it stands in
+    folder: str = ""  # of the file that has it
 
 
 def load(
@@ -410,9 +409,9 @@ def load(
     environ: Mapping[str, str] | None = None,
     directory: str | None = None,
 ) -> Config:
-    """Read all sources, `settings` being what `init()` was given.
+    """Read all sources; `settings` are the arguments of `init()`.
 
-    The environment and the directory to start from are the process's own unless given.
+    By default the environment and the directory to start from are the process's.
     """
     environ = os.environ if environ is None else environ
     if message := _config_sources.file_error(directory or os.curdir):
@@ -459,13 +458,13 @@ def _of_the_original(setting: _Setting) -> str | None:
 
 
 def _unknown(setting: _Setting) -> str:
-    import difflib  # only needed once things have gone wrong
+    import difflib  # only errors need it
 
     valid = [setting.spelling(key) for key in _KEYS]
     written = setting.spelling(setting.key)
-    # An agent's variables are suggested only to who meant one: they configure no program.
+    # An agent's variable configures no program: it is suggested only for a very similar name.
     close = difflib.get_close_matches(written, AGENT_VARIABLES, n=1, cutoff=0.9)
-    if not close:  # by its own part: what all names begin with makes any two alike
+    if not close:  # without the prefix, which would make all names similar
         close = [
             setting.spelling(key) for key in difflib.get_close_matches(setting.key, _KEYS, 1, 0.58)
         ]
@@ -534,8 +533,8 @@ _SERVICE_LINK = re.compile(r"(FIBER\w*?)_(SERVICE_HOST|SERVICE_PORT\w*|PORT(_\d+
 
 
 def _is_service_link(name: str, environ: Mapping[str, str]) -> bool:
-    # Kubernetes tells every pod of a namespace about a Service fiber-x by variables
-    # FIBER_X_SERVICE_HOST, FIBER_X_PORT and so on, which nobody wrote.
+    # For a Service fiber-x Kubernetes sets the variables FIBER_X_SERVICE_HOST, FIBER_X_PORT and
+    # so on in every pod of its namespace.
     link = _SERVICE_LINK.fullmatch(name)
     return link is not None and f"{link[1]}_SERVICE_HOST" in environ
 
@@ -568,7 +567,7 @@ def _nearest_pyproject(directory: str | None) -> str | None:
 
 
 def _read_toml(path: str) -> dict[str, Any]:
-    import tomllib  # most programs have no pyproject.toml around them
+    import tomllib  # most programs have no pyproject.toml
 
     try:
         with open(path, "rb") as file:

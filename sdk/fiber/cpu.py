@@ -1,4 +1,4 @@
-"""Number of CPUs that this process may use, which in a container is not that of the host."""
+"""Number of CPUs that this process may use: in a container fewer than the host has."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ __all__ = ["cpu_count"]
 
 
 def cpu_count() -> int:
-    """Number of CPUs that this process may use, at least 1.
+    """Return the number of CPUs that this process may use, at least 1.
 
-    Differs from `multiprocessing.cpu_count()`, which counts the host's: this is the smaller
-    of the affinity mask (taskset, cpuset) and the CPU quota of the control group (`docker
-    run --cpus`, a pod's limit), a quota of 1.5 counting as 2 so that none of it lies idle.
-    Read anew at each call.
+    It is the smaller of the affinity mask (taskset, cpuset) and the CPU quota of the control
+    group (`docker run --cpus`, a pod's limit). A quota of 1.5 counts as 2, so that all of it
+    is used. Differs from `multiprocessing.cpu_count()`, which counts the host's CPUs. Each
+    call reads the limits again.
     """
     allowed = len(os.sched_getaffinity(0))
     return max(1, math.ceil(min(allowed, _cgroup_quota("/proc/self"))))
@@ -30,7 +30,7 @@ class _Mount(NamedTuple):
 
 
 def _cgroup_quota(proc: str) -> float:
-    """The tightest CPU quota of the control groups around the process; infinity if none."""
+    """Return the smallest CPU quota of the process's control groups; infinity if none."""
     memberships = _memberships(f"{proc}/cgroup")
     quotas = [
         quota
@@ -43,7 +43,7 @@ def _cgroup_quota(proc: str) -> float:
 
 
 def _memberships(path: str) -> dict[bool, str]:
-    """The process's control group in version 2 (key True) and in version 1's cpu hierarchy."""
+    """Return the process's control group of version 2 (key True) and of version 1 (False)."""
     groups = {}
     for line in _read(path).splitlines():
         _, controllers, group = line.split(":", 2)
@@ -71,11 +71,10 @@ def _unescape(field: str) -> str:
 
 
 def _ancestry(mount: _Mount, group: str) -> Iterator[str]:
-    """The directories of a group and of all groups around it: each of them limits it."""
+    """Yield the directories of a group and of all groups around it, which limit it, too."""
     relative = os.path.relpath(group, mount.root)
     if relative.startswith(".."):
-        # Not below what is mounted here (a foreign namespace): the mount's top is the
-        # closest that can be seen.
+        # The group is not below the mount (a foreign namespace): take the top of the mount.
         relative = "."
     directory = os.path.normpath(os.path.join(mount.point, relative))
     while directory != mount.point:
@@ -99,7 +98,7 @@ def _quota(directory: str, unified: bool) -> float | None:
 
 
 def _read(path: str) -> str:
-    # No /proc, no such controller, a hidden group: without a readable limit there is none.
+    # No /proc, no such controller, a hidden group: an unreadable limit counts as no limit.
     try:
         with open(path, encoding="utf-8") as file:
             return file.read()

@@ -1,4 +1,4 @@
-"""joblib's parallel loops on Fiber: importing this registers the backend ``"fiber"``.
+"""joblib's parallel loops on Fiber.  The import of this module registers the backend ``"fiber"``.
 
 ::
 
@@ -8,9 +8,9 @@
     with joblib.parallel_config(backend="fiber", n_jobs=-1):
         search.fit(X, y)  # of scikit-learn, for instance
 
-The backend makes a ``fiber.Executor`` of ``n_jobs`` workers, with the options that are given beside
-``backend=``: ``retries=0``, ``initializer=``.  The next loop with the same options has the same
-workers.  ``executor=`` is one of yours in its place, perhaps with options:
+The backend makes a ``fiber.Executor`` of ``n_jobs`` workers, with the options beside ``backend=``:
+``retries=0``, ``initializer=``.  The next loop with the same options uses the same workers.
+``executor=`` is an existing executor to use in its place, perhaps with options:
 ``parallel_config(backend="fiber", executor=executor.options(memory="4Gi"))``.
 """
 
@@ -50,7 +50,7 @@ __all__ = ["FiberBackend"]
 _OPTIONS = frozenset(signature(Executor).parameters) - {"max_workers"}
 
 _SHARED_ARRAYS = 64
-"""At a time: each has a descriptor."""
+"""Largest number of shared arrays at a time.  Each needs a descriptor."""
 
 
 class FiberBackend(AutoBatchingMixin, ParallelBackendBase):  # type: ignore[misc]
@@ -75,7 +75,9 @@ class FiberBackend(AutoBatchingMixin, ParallelBackendBase):  # type: ignore[misc
             raise TypeError(f"executor must be a fiber.Executor, not {executor!r}")
         if executor is not None and (options or inner_max_num_threads is not None):
             given = [*options, *(["inner_max_num_threads"] if inner_max_num_threads else [])]
-            raise ValueError(f"executor= has workers already: give {', '.join(given)} to that one")
+            raise ValueError(
+                f"executor= has workers already: give {', '.join(given)} to that executor"
+            )
         if unknown := options.keys() - _OPTIONS:
             raise TypeError(
                 f"the backend fiber has no {', '.join(sorted(unknown))}: expected executor, or "
@@ -105,7 +107,7 @@ class FiberBackend(AutoBatchingMixin, ParallelBackendBase):  # type: ignore[misc
         return max(workers + 1 + n_jobs, 1)
 
     def configure(self, n_jobs: int = 1, parallel: Any = None, **options: Any) -> int:
-        """Be ready for one more loop."""
+        """Prepare for one more loop; return the number of its jobs."""
         n_jobs = self.effective_n_jobs(n_jobs)
         if n_jobs == 1 and self._given is None:
             raise FallbackToBackend(SequentialBackend(nesting_level=self.nesting_level))
@@ -118,13 +120,13 @@ class FiberBackend(AutoBatchingMixin, ParallelBackendBase):  # type: ignore[misc
         return n_jobs
 
     def submit(self, func: Callable[[], Any], callback: Any = None) -> Future[Any]:
-        """Have a batch of tasks run, and ``callback`` called with its future then."""
+        """Run a batch of tasks; call ``callback`` with its future at the end."""
         future: Future[Any]
         try:
             assert self._workers is not None
             assert self._arguments is not None
             future = self._workers.submit(self._arguments.of(func))
-        except Exception as error:  # joblib would print what is raised here, and wait for ever
+        except Exception as error:  # joblib would print an error from here, and wait for ever
             future = Future()
             future.set_exception(error)
         else:
@@ -142,7 +144,7 @@ class FiberBackend(AutoBatchingMixin, ParallelBackendBase):  # type: ignore[misc
         return out.result()
 
     def abort_everything(self, ensure_ready: bool = True) -> None:
-        """The loop has failed: cancel what has not begun, and end workers of our own."""
+        """End a failed loop: cancel waiting batches, and end the workers of its executor."""
         for future in tuple(self._unfinished):
             future.cancel()
         own, self._own = self._own, None
@@ -152,7 +154,7 @@ class FiberBackend(AutoBatchingMixin, ParallelBackendBase):  # type: ignore[misc
                 self._workers = self._start(own.options, self.parallel.n_jobs)
 
     def terminate(self) -> None:
-        """A loop is over.  Workers stay for the next one, until they are idle for too long."""
+        """End a loop.  The workers stay for the next loop, until ``idle_timeout``."""
         self.reset_batch_stats()
         if self._loops:
             self._loops.pop()
@@ -165,7 +167,7 @@ class FiberBackend(AutoBatchingMixin, ParallelBackendBase):  # type: ignore[misc
                 _keep(own)
 
     def _start(self, options: dict[str, Any], n_jobs: int) -> Executor:
-        """An executor with these options: the last one, if it has them."""
+        """Return an executor with these options: the last one, if it has the same."""
         workers = self.effective_n_jobs(n_jobs)
         threads = self._prepare_worker_env(workers)
         wanted = (workers, threads, options, os.getpid())
@@ -175,7 +177,7 @@ class FiberBackend(AutoBatchingMixin, ParallelBackendBase):  # type: ignore[misc
 
 
 class _Own:
-    """An executor of the backend's own."""
+    """Executor that the backend has made."""
 
     def __init__(
         self, workers: int, threads: dict[str, str], options: dict[str, Any], process: int
@@ -190,7 +192,7 @@ class _Own:
         """Tell whether a new executor with these arguments would be the same."""
         try:
             return bool(self._made_with == wanted)
-        except Exception:  # as arrays have it that are compared
+        except Exception:  # arrays among the options cannot be compared
             return False
 
 
@@ -221,7 +223,7 @@ def _prepare(
     try:
         from threadpoolctl import threadpool_limits
     except ImportError:
-        pass  # what is imported from now on reads the variables
+        pass  # libraries that are imported later read the variables
     else:
         threadpool_limits(int(threads["OMP_NUM_THREADS"]))
     if initializer is not None:
@@ -229,15 +231,15 @@ def _prepare(
 
 
 class MemmappedArguments:
-    """Large arrays among the arguments of one loop, or of loops over each other's results.
+    """Large arrays among the arguments of one loop, or of nested loops.
 
-    Workers of this host map them, as loky's do.  An array that is sent once is pickled, which takes
-    less time than to share it.  One that is sent again, such as the data of a grid search, is
+    Workers of this host map them, as loky's do.  The first time an array is pickled, since that is
+    faster than sharing it.  An array that is sent again, such as the data of a grid search, is
     copied to shared memory once.  A worker of another host gets a copy with each task.
 
-    ``options`` are ``joblib.Parallel``'s ``max_nbytes`` and ``mmap_mode``.  An array is large with
-    more than ``max_nbytes`` bytes; tasks see it as ``mmap_mode`` says: "r" is read-only.  Arrays
-    within an argument, a list or a table, are not looked for.
+    ``options`` are ``joblib.Parallel``'s ``max_nbytes`` and ``mmap_mode``.  An array above
+    ``max_nbytes`` bytes is large.  Tasks get it in the mode ``mmap_mode``: "r" is read-only.
+    Arrays inside of an argument, such as a list or a table, are pickled.
     """
 
     def __init__(self, options: Mapping[str, Any], *, same_host: bool) -> None:
@@ -248,7 +250,7 @@ class MemmappedArguments:
         self._shared: dict[int, SharedBuffer] = {}
 
     def of(self, batch: Any) -> Any:
-        """The batch, to be pickled at once and sent."""
+        """Return the batch in the form to pickle, at once, and send."""
         if not isinstance(batch, BatchedCalls):
             return batch
         sent = copy.copy(batch)
@@ -259,7 +261,7 @@ class MemmappedArguments:
         return sent
 
     def close(self) -> None:
-        """Forget what was shared; who maps it still has it."""
+        """Drop the shared arrays.  Processes that map them keep them."""
         self._sent.clear()
         self._shared.clear()
 
@@ -267,7 +269,7 @@ class MemmappedArguments:
         if type(value) not in (np.ndarray, np.memmap) or value.dtype.hasobject:
             return value
         mapped = _get_backing_memmap(value) if self._same_host else None
-        if isinstance(mapped, np.memmap):  # and not memory without a name
+        if isinstance(mapped, np.memmap):  # not anonymous memory
             return _Reduced(*_reduce_memmap_backed(value, mapped))
         if self._max_nbytes is None or self._mode is None or value.nbytes <= self._max_nbytes:
             return value
@@ -278,7 +280,7 @@ class MemmappedArguments:
         return _Reduced(_array, (buffer, value.dtype, value.shape, order, self._mode))
 
     def _buffer(self, array: Any) -> SharedBuffer | None:
-        """The memory that has a copy of it; None if it is to be pickled."""
+        """Return shared memory with a copy of the array; None if it should be pickled."""
         number = id(array)
         again = number in self._sent
         if number in self._shared:
@@ -309,7 +311,7 @@ class _Reduced:
 
 def _array(buffer: SharedBuffer, dtype: Any, shape: tuple[int, ...], order: Any, mode: str) -> Any:
     array = np.ndarray(shape, dtype, buffer.view, order=order)
-    if mode == "c":  # each task may write to a copy of its own
+    if mode == "c":  # copy on write: each task gets a copy
         return array.copy(order)
     return _read_only(array) if mode == "r" else array
 

@@ -223,7 +223,7 @@ class Pool:
         *,
         timeout: float | None = None,
     ) -> list[_T]:
-        """``[func(x) for x in iterable]``, the calls spread over the workers.
+        """Return ``[func(x) for x in iterable]``; workers run the calls.
 
         ``chunksize`` consecutive items go to one worker together.  By default it adapts to the
         duration of the tasks.  An iterator is read as fast as its tasks run.  ``timeout``, as in
@@ -239,7 +239,7 @@ class Pool:
         *,
         timeout: float | None = None,
     ) -> list[_T]:
-        """``[func(*x) for x in iterable]``, otherwise as ``map``."""
+        """Return ``[func(*x) for x in iterable]``, otherwise as ``map``."""
         return self._map(work.STAR, func, iterable, chunksize, timeout)
 
     def map_async(

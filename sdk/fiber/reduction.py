@@ -113,7 +113,7 @@ class Spawning:
 
 
 def spawning() -> Any:
-    """The Spawning in progress on this thread, None outside of a start on this host."""
+    """Return the Spawning of this thread; None unless it starts a process on this host."""
     return mp_context.get_spawning_popen()
 
 

@@ -1,4 +1,4 @@
-"""Files of the program that are sent to workers on other machines, and those that are not.
+"""Lists of the program's files that are sent to workers on other hosts, and that are not.
 
     print(fiber.shipping.listing())
 
@@ -27,13 +27,13 @@ class Sent:
     """A file or link that is sent."""
 
     path: str
-    """The path here."""
+    """Path on this host."""
     name: str
-    """The path in the folder that workers have of the program."""
+    """Path in the workers' copy of the program's folder."""
     size: int
     """Bytes."""
     reason: str
-    """Why it is sent."""
+    """Reason for which it is sent."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,13 +41,13 @@ class LeftOut:
     """A file, folder or link that is not sent."""
 
     path: str
-    """The path here."""
+    """Path on this host."""
     size: int | None
-    """Bytes, of a folder with all that is in it; None if that cannot be counted: it has too many
-    files, or is not readable.
+    """Bytes, for a folder with its contents.  None for a folder that has too many files or is not
+    readable.
     """
     reason: str
-    """Why it is left out."""
+    """Reason for which it is left out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,12 +92,12 @@ class Listing:
 
 
 def listing() -> Listing:
-    """Return what a pool that is made now would send of this program to workers elsewhere.
+    """Return the files that a pool would now send to workers on other hosts.
 
-    It is the same for every backend, also for one whose workers need nothing sent.  Nothing is sent
-    and no process is started.
+    The result is the same for every backend, also for one that sends no files.  This sends no file
+    and starts no process.
     """
-    # pdb leaves its program a main module without one.
+    # Under pdb the main module has no __spec__.
     vars(sys.modules["__main__"]).setdefault("__spec__", None)
     layout = find_layout(spawn.get_preparation_data(""), frozenset())
     files, left_out = program_files.select(layout, bounded=False)
@@ -138,7 +138,7 @@ def _reason(layout: Layout, path: str, imported: frozenset[str]) -> str:
 
 
 def _size_of(path: str, sent: frozenset[str]) -> int | None:
-    """Bytes of what is at ``path``, without what is sent of it, links and bytecode."""
+    """Return the bytes at ``path``, without links, bytecode and the files that are sent."""
     if os.path.islink(path) or not os.path.isdir(path):
         return _bytes_of(path)
     if not os.access(path, os.R_OK | os.X_OK):

@@ -273,7 +273,7 @@ class TestRefusals:
         assert "'shared_memory' is multiprocessing.shared_memory" in text
         assert "'Lock' is multiprocessing.synchronize.Lock" in text
         assert "'Process'" not in text
-        assert "What to do" in text
+        assert "Replace these objects" in text
         assert dict(vars(module)) == before
 
     def test_a_start_method_that_fiber_lacks(self, library: Library, fiber: Any) -> None:

@@ -177,7 +177,7 @@ def test_bad_options(options: Any, error: type[Exception], says: str) -> None:
 def test_options_of_workers_that_are_there() -> None:
     with (
         fiber.Executor(1) as executor,
-        pytest.raises(ValueError, match="give retries, inner_max_num_threads to that one"),
+        pytest.raises(ValueError, match="give retries, inner_max_num_threads to that executor"),
     ):
         fiber.joblib.FiberBackend(executor=executor, retries=1, inner_max_num_threads=2)
 

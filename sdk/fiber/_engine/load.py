@@ -63,7 +63,7 @@ class WorkersByLoad:
             self.idle_pinned.pop(worker, None)
 
     def last_idle(self) -> WorkerEntry | None:
-        """Return the worker that became idle last: its memory is warm, and the others may leave."""
+        """Return the worker that became idle last: its caches are warm, and others may end."""
         return next(reversed(self.idle), None)
 
     def queueable_after(self, spared: int) -> WorkerEntry | None:

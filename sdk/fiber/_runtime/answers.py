@@ -1,7 +1,7 @@
 """Answers of workers: checked, and decoded as far as that runs none of the user's code.
 
-A task can write to the channel of its own worker, by mistake or because it was taken over.  So each
-message is checked before it is believed.  The form of the messages is in ``fiber._wire.work``.
+A task can write to its worker's channel, by mistake or under the control of an attacker.  So each
+message is checked before it is used.  The form of the messages is in ``fiber._wire.work``.
 
 The loop thread never runs the user's code, and unpickling may.  So a value that is not plain stays
 pickled until its reader asks for it, on the thread of the reader."""

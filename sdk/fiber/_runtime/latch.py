@@ -2,9 +2,9 @@
 
 ``threading.Event`` has one lock, which waiters and setters share.  Suppose that a signal handler
 runs while its thread holds this lock.  If the handler raises, the lock may stay locked for ever.
-If the handler waits or sets, it deadlocks with its own thread.  Here each waiter has a separate
-lock, for which no other thread waits.  A finalizer on the loop thread may set the event; if it
-waits, it gets an error.
+If the handler waits or sets, it waits for the thread that it interrupted: a deadlock.  Here each
+waiter has a separate lock, for which no other thread waits.  A finalizer on the loop thread may set
+the event; if it waits, it gets an error.
 
 CPython notes a signal, and runs the handler between two instructions.  A signal may arrive after
 the last instruction and before the kernel puts the thread to sleep on a lock.  Then the handler
@@ -23,7 +23,7 @@ from fiber._transport.loop import DOZE
 
 
 class Waiters:
-    """Waiters, each with its own lock."""
+    """Waiters, each with a separate lock."""
 
     __slots__ = ("_locks",)
 
