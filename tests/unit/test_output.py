@@ -126,3 +126,18 @@ def test_a_stuck_stderr_gathers_no_lines_that_were_shown(stderr: Stuck, lines: O
     stderr.goes_on.set()
     stderr.wait_for("999 of 1000")
     assert stderr.getvalue().count("of 1000") <= 3
+
+
+def test_without_a_thread_lines_are_written_at_the_end(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refuse(thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    lines = Output()
+    with monkeypatch.context() as patched:
+        patched.setattr(threading.Thread, "start", refuse)
+        lines.write("one", "first")
+        lines.write("one", "second")
+        lines.close()
+    assert capsys.readouterr().err == "[one] first\n[one] second\n"

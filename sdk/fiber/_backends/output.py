@@ -62,16 +62,23 @@ class Output:
         """Write what is left."""
         if self._line:
             self.show("")
-        if self._thread is not None:
-            with self._lock:
-                self._say_what_is_left_out()
-            self._lines.put(None)
+        with self._lock:
+            self._say_what_is_left_out()
+        self._lines.put(None)
+        if self._thread is None:
+            self._run()
+        else:
             self._thread.join(timeout=2)
 
     def _start(self) -> None:
-        if self._thread is None:
-            self._thread = threading.Thread(target=self._run, name="fiber-output", daemon=True)
-            self._thread.start()
+        with self._lock:
+            if self._thread is None:
+                thread = threading.Thread(target=self._run, name="fiber-output", daemon=True)
+                # The system may have no thread to give.  Then the next line starts it, or ``close``
+                # writes the lines.
+                with contextlib.suppress(RuntimeError):
+                    thread.start()
+                    self._thread = thread
 
     def _say_what_is_left_out(self) -> None:
         number, self._left_out = self._left_out, 0
