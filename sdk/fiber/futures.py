@@ -37,12 +37,12 @@ from fiber import cpu, errors
 from fiber._exceptions import fresh, report_uncaught
 from fiber._runtime import options, start_methods
 from fiber._runtime.answers import Pickled, TaskFailure
-from fiber._runtime.background import BackgroundThread
 from fiber._runtime.executor import PoolExecutor
 from fiber._runtime.executor_group import ExecutorGroup, broken, refusal
 from fiber._runtime.jobs import CallQueue
 from fiber._runtime.options import PoolOptions
 from fiber._runtime.state import runtime
+from fiber._runtime.threads import BackgroundThread
 from fiber._runtime.work_items import WorkItem
 from fiber._wire import work
 from fiber.process import PoolProcess, process_type

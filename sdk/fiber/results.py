@@ -19,7 +19,7 @@ from typing import Any, Generic, Protocol, Self, TypeVar
 from fiber._exceptions import fresh
 from fiber._runtime.answers import Pickled, TaskFailure, decode, is_failure
 from fiber._runtime.executor import PoolExecutor
-from fiber._runtime.latch import Latch, Waiters, acquire
+from fiber._runtime.threads import Latch, Waiters, acquire
 from fiber._runtime.work_items import InputStream, WorkItem
 
 __all__ = ["ApplyResult", "AsyncResult", "IMapIterator", "IMapUnorderedIterator", "MapResult"]

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from fiber._engine.chunks import LIMIT
 from fiber._engine.ledger import Ledger
-from fiber._engine.load import PATIENCE
-from fiber._engine.tasks import Batch, Job, Loss, Receipt, WorkerEntry
+from fiber._engine.tasks import RECALL_AFTER, Batch, Job, Loss, Receipt, WorkerEntry
 from simulation.oracle import Account, Violation, require
 from simulation.workers import Ref
 
@@ -18,7 +17,7 @@ if TYPE_CHECKING:
     from simulation.world import World
 
 SLACK = 1e-3
-"""Seconds after PATIENCE until which an idle worker must have asked for an unread batch."""
+"""Seconds after RECALL_AFTER until which an idle worker must have asked for an unread batch."""
 
 
 PASSES = 3
@@ -351,11 +350,13 @@ class Audit:
                     asked += 1
                 elif (
                     now
-                    > max(worker.since, self._watched.setdefault(worker, now)) + PATIENCE + SLACK
+                    > max(worker.since, self._watched.setdefault(worker, now))
+                    + RECALL_AFTER
+                    + SLACK
                 ):
                     late.append(worker)
                 else:
-                    self._world.loop.call_later(PATIENCE + 2 * SLACK, self._check_idle)
+                    self._world.loop.call_later(RECALL_AFTER + 2 * SLACK, self._check_idle)
         if late and asked < len(idle):
             raise Violation(
                 f"{self._names.child(late[0]).name} keeps an unread batch from an idle worker"

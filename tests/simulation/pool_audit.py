@@ -7,7 +7,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from fiber._engine.chunks import TaskPace
-from fiber._engine.scheduler import Decisions
+from fiber._engine.scheduler import Decisions, PoolMember
 from fiber._engine.start_failures import (
     KILLED_PATIENCE,
     LAST_PAUSE,
@@ -18,7 +18,6 @@ from fiber._engine.start_failures import (
     StartFailure,
 )
 from fiber._engine.tasks import Loss
-from fiber._engine.worker_set import PoolMember
 from fiber._runtime.executor import PoolExecutor
 from fiber._runtime.jobs import TICK
 from fiber._runtime.work_items import AHEAD, InputStream, WorkItem

@@ -22,7 +22,7 @@ from fiber._agent import service
 from fiber._agent.interface import UNKNOWN, Cause, ExitReport
 from fiber._backends import remote
 from fiber._backends.remote import RemoteTaskChannel
-from fiber._runtime import executor, receiver, workers
+from fiber._runtime import exchange, executor, workers
 from fiber._wire.packet import Message
 from simulation.agents import Agent, Child
 from simulation.remote_hosts import NoCapture, RemoteHost
@@ -63,7 +63,7 @@ class Stage:
         channel = partial(StagedTaskChannel, self)
         self._stack.enter_context(mock.patch.object(remote, "RemoteTaskChannel", channel))
         self._stack.enter_context(mock.patch.object(executor, "say", self._say))
-        self._stack.enter_context(mock.patch.object(receiver, "say", self._say))
+        self._stack.enter_context(mock.patch.object(exchange, "say", self._say))
         self._stack.enter_context(mock.patch.object(workers, "Latch", partial(StagedLatch, self)))
         self._stack.enter_context(mock.patch.object(PlannedError, "unpickled", self.run_user_code))
 

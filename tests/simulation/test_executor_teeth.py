@@ -7,17 +7,15 @@ from typing import Any
 
 import pytest
 
-from fiber._engine import start_failures, worker_set
-from fiber._engine.scheduler import Decisions, Scheduler
+from fiber._engine import scheduler, start_failures
+from fiber._engine.scheduler import Decisions, PoolMember, Scheduler
 from fiber._engine.start_failures import StartFailure
 from fiber._engine.tasks import Batch, Job, Loss, Receipt, WorkerEntry
-from fiber._engine.worker_set import PoolMember
 from fiber._runtime.answers import Pickled
+from fiber._runtime.exchange import AnswerReceiver, BatchSender, TimeLimits
 from fiber._runtime.executor import PoolExecutor
 from fiber._runtime.jobs import CallQueue, Calls, Jobs
 from fiber._runtime.leases import Lease, Leases
-from fiber._runtime.receiver import AnswerReceiver
-from fiber._runtime.sender import BatchSender, TimeLimits
 from fiber._runtime.work_items import Call, InputStream
 from fiber._runtime.workers import WorkerHandle
 from simulation.explore import first_failure
@@ -85,10 +83,10 @@ def never_looks_again(patch: Patch) -> None:
 
 
 def forgets_that_somebody_left(patch: Patch) -> None:
-    def let_go(self: worker_set.PoolWorkerSet, member: PoolMember) -> None:
+    def let_go(self: scheduler.PoolWorkerSet, member: PoolMember) -> None:
         member.leaving = True
 
-    patch.setattr(worker_set.PoolWorkerSet, "let_go", let_go)
+    patch.setattr(scheduler.PoolWorkerSet, "let_go", let_go)
 
 
 def gives_up_at_once(patch: Patch) -> None:
@@ -98,20 +96,20 @@ def gives_up_at_once(patch: Patch) -> None:
 
 
 def never_gives_up(patch: Patch) -> None:
-    def _failed(self: worker_set.PoolWorkerSet, failure: StartFailure, now: float) -> None:
+    def _failed(self: scheduler.PoolWorkerSet, failure: StartFailure, now: float) -> None:
         real(self, failure, now)
         self.error = None
 
-    real = worker_set.PoolWorkerSet._failed
-    patch.setattr(worker_set.PoolWorkerSet, "_failed", _failed)
+    real = scheduler.PoolWorkerSet._failed
+    patch.setattr(scheduler.PoolWorkerSet, "_failed", _failed)
 
 
 def gives_up_with_workers_at_work(patch: Patch) -> None:
-    patch.setattr(worker_set.PoolWorkerSet, "_at_work", lambda _: False)
+    patch.setattr(scheduler.PoolWorkerSet, "_at_work", lambda _: False)
 
 
 def tells_nobody_that_none_starts(patch: Patch) -> None:
-    patch.setattr(worker_set.PoolWorkerSet, "news", lambda *_: "")
+    patch.setattr(scheduler.PoolWorkerSet, "news", lambda *_: "")
 
 
 def hears_nothing_back(patch: Patch) -> None:

@@ -11,7 +11,7 @@ from typing import Any, NoReturn
 
 import pytest
 
-from fiber._runtime.background import BackgroundThread
+from fiber._runtime.threads import BackgroundThread
 from patience import PATIENCE
 
 

@@ -15,7 +15,7 @@ import pytest
 
 import fiber
 from fiber._exceptions import fresh
-from fiber._runtime.background import BackgroundThread
+from fiber._runtime.threads import BackgroundThread
 from fiber._transport.loop import Loop
 from fiber.errors import ConnectionClosed, WorkerDied
 from patience import PATIENCE

@@ -16,11 +16,11 @@ import pytest
 
 from fiber._agent.interface import ExitReport
 from fiber._agent.last_words import TELL
-from fiber._engine import load
-from fiber._runtime import sender, workers
+from fiber._engine import tasks as entries
+from fiber._runtime import exchange, workers
 from fiber._runtime.answers import Pickled, TaskFailure
 from fiber._runtime.executor import PoolExecutor
-from fiber._runtime.latch import Latch
+from fiber._runtime.threads import Latch
 from fiber._runtime.work_items import Call, InputStream
 from fiber._runtime.workers import KILL_AFTER, WorkerHandle
 from fiber._wire import work
@@ -151,7 +151,7 @@ def test_idle_workers_get_what_busy_ones_have_not_read(rig: Rig) -> None:
     for seq, _ in list(rig.children[0].packets):
         rig.answer(idle, seq, [seq])
     assert rig.children[1].recalls == 0
-    rig.loop.pass_time(load.PATIENCE)
+    rig.loop.pass_time(entries.RECALL_AFTER)
     assert rig.children[1].recalls == 1
     unread = rig.children[1].packets[1][0]
     busy.recalled([unread])
@@ -383,7 +383,7 @@ def test_nobody_waits_long_for_the_end_of_a_worker(rig: Rig) -> None:
     results = rig.call(timeout=2.0)
     (handle,) = rig.busy
     rig.loop.pass_time(2.0)
-    rig.loop.pass_time(sender.STACK_PATIENCE)
+    rig.loop.pass_time(exchange.STACK_PATIENCE)
     assert "2 s" in str(results.outcomes[0].error)
     assert rig.child(handle).signals == [TELL, signal.SIGKILL]
     rig.answer(handle, rig.child(handle).packets[0][0], [9])

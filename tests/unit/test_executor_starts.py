@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 import pytest
 
 from fiber._agent.interface import Cause, ExitReport
-from fiber._engine import start_failures, worker_set
+from fiber._engine import scheduler, start_failures
 from fiber._runtime.workers import KILL_AFTER
 from fiber._wire import work
 from fiber.errors import FiberError
@@ -145,13 +145,13 @@ def test_what_an_end_says_of_a_worker_is_told_by_its_cause_in_whatever_words(
     cause: Cause, told: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     failures: list[start_failures.StartFailure | None] = []
-    gone = worker_set.PoolWorkerSet.gone
+    gone = scheduler.PoolWorkerSet.gone
 
     def noting(self: Any, member: Any, now: float, failure: Any = None) -> None:
         failures.append(failure)
         gone(self, member, now, failure)
 
-    monkeypatch.setattr(worker_set.PoolWorkerSet, "gone", noting)
+    monkeypatch.setattr(scheduler.PoolWorkerSet, "gone", noting)
     rig = Rig(1, ready=False)
     rig.handles[0].exited(ExitReport(1, "agent could not be started", cause=cause))
     assert [failure is not None for failure in failures] == [told]

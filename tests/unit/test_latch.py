@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from fiber._runtime.latch import Latch, Waiters, acquire
+from fiber._runtime.threads import Latch, Waiters, acquire
 from fiber._runtime.work_items import InputStream
 from patience import PATIENCE
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from fiber._engine.chunks import SLOW
-from fiber._engine.load import PATIENCE
-from fiber._engine.tasks import Limits
+from fiber._engine.tasks import RECALL_AFTER, Limits
 from unit.ledger_steps import answer, assign_all, job_of, known, ledger_with, run_to_end
 
 # Taking back
@@ -19,11 +18,11 @@ def test_idle_workers_ask_for_what_others_have_not_begun() -> None:
     for batch in batches:
         if batch.worker is one:
             answer(ledger, batch)
-    assert ledger.recall(PATIENCE / 2) == []
-    assert ledger.next_recall() == pytest.approx(PATIENCE)
-    assert ledger.recall(PATIENCE) == [other]
-    assert ledger.recall(PATIENCE) == [], "asked twice"
-    ledger.put_back(other, [other.queue[1].seq], PATIENCE)
+    assert ledger.recall(RECALL_AFTER / 2) == []
+    assert ledger.next_recall() == pytest.approx(RECALL_AFTER)
+    assert ledger.recall(RECALL_AFTER) == [other]
+    assert ledger.recall(RECALL_AFTER) == [], "asked twice"
+    ledger.put_back(other, [other.queue[1].seq], RECALL_AFTER)
     (stolen,) = assign_all(ledger)
     assert stolen.worker is one
 
@@ -34,8 +33,8 @@ def test_who_does_not_answer_does_not_keep_others_from_being_asked() -> None:
     for batch in assign_all(ledger):
         if batch.worker is one:
             answer(ledger, batch)
-    assert len(ledger.recall(PATIENCE)) == 1
-    assert len(ledger.recall(PATIENCE)) == 1
+    assert len(ledger.recall(RECALL_AFTER)) == 1
+    assert len(ledger.recall(RECALL_AFTER)) == 1
     assert other.recalled
     assert third.recalled
     assert ledger.next_recall() is None
@@ -47,7 +46,7 @@ def test_the_time_to_ask_is_the_time_that_was_said() -> None:
     for batch in assign_all(ledger):
         if batch.worker is one:
             answer(ledger, batch)
-    other.since = 17.26  # 17.26 + PATIENCE - 17.26 < PATIENCE
+    other.since = 17.26  # 17.26 + RECALL_AFTER - 17.26 < RECALL_AFTER
     due = ledger.next_recall()
     assert due is not None
     assert ledger.recall(due) == [other]

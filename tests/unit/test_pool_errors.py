@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 import fiber
-from fiber._runtime.background import BackgroundThread
+from fiber._runtime.threads import BackgroundThread
 from fiber.errors import UnpicklableError
 from fiber.pool import AsyncResult, Pool
 from patience import PATIENCE

@@ -5,11 +5,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from fiber._engine.load import PATIENCE
-from fiber._engine.scheduler import Decisions, Scheduler
+from fiber._engine.scheduler import IDLE_DEATHS, Decisions, Scheduler
 from fiber._engine.start_failures import FIRST_PAUSE, RAISED_PATIENCE, StartFailure
-from fiber._engine.tasks import Job, Limits, WorkerEntry
-from fiber._engine.worker_set import IDLE_DEATHS
+from fiber._engine.tasks import RECALL_AFTER, Job, Limits, WorkerEntry
 from unit.ledger_steps import answer, known
 
 RAISED = StartFailure("pool worker 'w'", "exit status 1", "no such device")
@@ -136,10 +134,10 @@ def test_idle_workers_ask_for_what_busy_ones_have_not_read() -> None:
     for batch in list(idle.queue):
         answer(scheduler.ledger, batch)
     decisions = scheduler.decide(0.0)
-    assert (decisions.recall, decisions.wake_at) == ([], PATIENCE)
-    decisions = scheduler.decide(PATIENCE)
+    assert (decisions.recall, decisions.wake_at) == ([], RECALL_AFTER)
+    decisions = scheduler.decide(RECALL_AFTER)
     assert decisions.recall == [busy]
-    assert scheduler.decide(PATIENCE).recall == [], "it was asked"
+    assert scheduler.decide(RECALL_AFTER).recall == [], "it was asked"
 
 
 def test_a_worker_that_becomes_ready_after_it_was_told_to_go_gets_nothing() -> None:

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from fiber._engine.scheduler import IDLE_DEATHS, IDLE_PAUSE, PoolWorkerSet
 from fiber._engine.start_failures import (
     FIRST_PAUSE,
     KILLED_PATIENCE,
@@ -17,7 +18,6 @@ from fiber._engine.start_failures import (
     StartFailure,
 )
 from fiber._engine.tasks import WorkerEntry
-from fiber._engine.worker_set import IDLE_DEATHS, IDLE_PAUSE, PoolWorkerSet
 from fiber.errors import StartError
 
 RAISED = StartFailure("pool worker 'w'", "exit status 1", "no such device")

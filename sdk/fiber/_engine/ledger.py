@@ -27,7 +27,6 @@ from operator import attrgetter
 from typing import Any
 
 from fiber._engine.chunks import TaskPace
-from fiber._engine.load import WorkersByLoad
 from fiber._engine.tasks import (
     Batch,
     Job,
@@ -38,6 +37,7 @@ from fiber._engine.tasks import (
     Span,
     WaitingTasks,
     WorkerEntry,
+    WorkersByLoad,
     WrongAnswer,
 )
 

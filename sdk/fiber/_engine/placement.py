@@ -14,6 +14,11 @@ Agent = TypeVar("Agent", bound=Hashable)
 Child = TypeVar("Child", bound=Hashable)
 
 
+LINGER = 2.0
+"""Seconds for which agents that have not joined stay wanted once no child needs them.  Soon a pool
+may replace a worker that died, or the program may start its next pool."""
+
+
 class Placement(Generic[Agent, Child]):
     """Agents with ``slots`` places each, and the children that wait for one, in order.
 
@@ -138,11 +143,6 @@ class Placement(Generic[Agent, Child]):
                 del self._with_room[load]
             if self.slots != math.inf:
                 self._room -= self.slots - load
-
-
-LINGER = 2.0
-"""Seconds for which agents that have not joined stay wanted once no child needs them.  Soon a pool
-may replace a worker that died, or the program may start its next pool."""
 
 
 class Desired(NamedTuple):

@@ -24,7 +24,7 @@ from fiber import reduction
 from fiber._exceptions import fresh
 from fiber._hub.client import ObjectUnreachable
 from fiber._managers.client import NUMBER, ManagerSession, new_holder, proxy_of, session
-from fiber._runtime.latch import Waiters, acquire
+from fiber._runtime.threads import Waiters, acquire
 from fiber.errors import ConnectionClosed, TimeoutError
 
 _mp: Any = mp_managers  # typeshed has part of it

@@ -18,6 +18,21 @@ from fiber._wire import work
 from fiber._wire.memory_files import BytesLike
 from fiber._wire.packet import Message
 
+Words: TypeAlias = tuple[Any, ...]
+"""Content of a worker's message.  Results are (seq, offset, kept, seconds, values, mixed, size).
+``mixed``: some values are ``Pickled``.  ``size``: bytes of the message."""
+
+OTHER = object()
+"""Mark in place of a result: the message is another one."""
+
+_FORMS: dict[str, Callable[..., bool]] = {
+    work.READY: lambda: True,
+    work.INIT_FAILED: lambda text: type(text) is str,
+    work.UNKNOWN: lambda seq: type(seq) is int,
+    work.BROKEN: lambda seq, error: type(seq) is int and type(error) is bytes,
+    work.UNREADABLE: lambda seq, error: type(seq) is int and type(error) is bytes,
+}
+
 
 class TaskFailure:
     """Outcome of a task that raised ``error``, or that could not run."""
@@ -94,14 +109,6 @@ class _Unreadable:
 _UNREADABLE = _Unreadable()
 
 
-Words: TypeAlias = tuple[Any, ...]
-"""Content of a worker's message.  Results are (seq, offset, kept, seconds, values, mixed, size).
-``mixed``: some values are ``Pickled``.  ``size``: bytes of the message."""
-
-OTHER = object()
-"""Mark in place of a result: the message is another one."""
-
-
 def single(message: Message, seq: int) -> Any:
     """Return the result of the call that was sent alone as ``seq``, or OTHER."""
     try:
@@ -141,12 +148,3 @@ def read(message: Message) -> Words:
         return seq, offset, kept, seconds, values, bool(odd), size
     except Exception as error:  # any bytes may be there
         raise WrongAnswer(f"it sent a malformed message ({error!r})") from None
-
-
-_FORMS: dict[str, Callable[..., bool]] = {
-    work.READY: lambda: True,
-    work.INIT_FAILED: lambda text: type(text) is str,
-    work.UNKNOWN: lambda seq: type(seq) is int,
-    work.BROKEN: lambda seq, error: type(seq) is int and type(error) is bytes,
-    work.UNREADABLE: lambda seq, error: type(seq) is int and type(error) is bytes,
-}

@@ -33,14 +33,12 @@ from fiber._engine.scheduler import Decisions, Scheduler
 from fiber._engine.start_failures import StartFailure
 from fiber._exceptions import fresh
 from fiber._runtime.answers import TaskFailure, decode
-from fiber._runtime.background import BackgroundThread, UserThreads, say
+from fiber._runtime.exchange import AnswerReceiver, BatchSender
 from fiber._runtime.jobs import TICK, CallQueue, Calls, Jobs
-from fiber._runtime.latch import Latch
 from fiber._runtime.leases import ADOPTED, UNAVAILABLE, LeasedWorker, Leases
 from fiber._runtime.options import PoolOptions
-from fiber._runtime.receiver import AnswerReceiver
-from fiber._runtime.sender import BatchSender
 from fiber._runtime.state import Runtime
+from fiber._runtime.threads import BackgroundThread, Latch, UserThreads, say
 from fiber._runtime.work_items import (
     Call,
     Function,

@@ -224,18 +224,13 @@ class Leases:
 
     # What happens to a worker while a caller uses it counts once the worker is back
 
-    def keep_answer(self, handle: WorkerHandle, words: Words) -> bool:
-        """Keep an answer until the worker is back; False if no caller leases the worker."""
-        worker = self._leased(handle)
-        if worker is not None:
-            worker.answer = words
-        return worker is not None
+    def keep_answer(self, handle: WorkerHandle, words: Words) -> None:
+        """Keep an answer of a leased worker until the worker is back."""
+        self._workers[handle].answer = words
 
     def keep_unread(self, handle: WorkerHandle, seqs: list[int]) -> None:
         """Keep calls that a leased worker gave back: a recall from before the lease took them."""
-        worker = self._leased(handle)
-        if worker is not None:
-            worker.unread.extend(seqs)
+        self._workers[handle].unread.extend(seqs)
 
     def keep_exit(self, handle: WorkerHandle, report: ExitReport) -> bool:
         """Keep the end of a worker until its caller notices; False if no caller uses it."""

@@ -11,8 +11,8 @@ from fiber import _logs
 from fiber._agent.interface import UNKNOWN, ChildHandle, ExitReport
 from fiber._agent.last_words import TELL
 from fiber._exceptions import fresh
-from fiber._runtime.latch import Latch
 from fiber._runtime.state import runtime
+from fiber._runtime.threads import Latch
 from fiber._transport.channels import naming_the_limit
 from fiber._transport.loop import Wakeup
 from fiber._wire.packet import Message

@@ -18,7 +18,7 @@ from fiber import reduction
 from fiber._engine.chunks import TaskPace
 from fiber._engine.tasks import Job, Limits
 from fiber._hub.handles import GrantSet
-from fiber._runtime.latch import check_may_wait
+from fiber._runtime.threads import check_may_wait
 from fiber._transport.loop import DOZE
 from fiber._wire import packet, work
 
@@ -27,6 +27,10 @@ FUNCTIONS = 128
 
 FUNCTION_SIZE = 1 << 16
 """Largest pickle, in bytes, of a function that is recognized."""
+
+
+AHEAD = 3
+"""Number of messages for which tasks are read ahead, for each worker."""
 
 
 class Function:
@@ -80,10 +84,6 @@ class FunctionCache:
                 self._known.clear()  # in one step, as several threads may call this
             self._known[data] = made
         return made
-
-
-AHEAD = 3
-"""Number of messages for which tasks are read ahead, for each worker."""
 
 
 class InputStream:
@@ -147,7 +147,7 @@ class InputStream:
     def _next_credit(self) -> int:
         while True:
             with contextlib.suppress(queue.Empty):
-                return self._credit.get(timeout=DOZE)  # not longer: see ``latch``
+                return self._credit.get(timeout=DOZE)  # not longer: see ``threads``
 
     def read_on_thread(
         self, iterable: Iterable[Any], finish: Callable[[BaseException | None], None]

@@ -13,19 +13,21 @@ from fiber import _logs
 from fiber._agent import worker
 from fiber._agent.interface import Cause, ChildHandle, ExitReport
 from fiber._agent.last_words import TELL
+from fiber._engine.scheduler import PoolWorkerSet
 from fiber._engine.start_failures import StartFailure
 from fiber._engine.tasks import WorkerEntry
-from fiber._engine.worker_set import PoolWorkerSet
 from fiber._exceptions import fresh
-from fiber._runtime.background import BackgroundThread
-from fiber._runtime.latch import Latch
 from fiber._runtime.options import PoolOptions
 from fiber._runtime.state import Runtime, SharedArguments
+from fiber._runtime.threads import BackgroundThread, Latch
 from fiber._transport.loop import Loop, LoopTimer, Wakeup
 from fiber._wire import work
 from fiber._wire.packet import Message
 from fiber.errors import FiberError
 from fiber.resources import Resources, merged, resources_of, with_resources
+
+KILL_AFTER = 2.0
+"""Seconds between SIGTERM and SIGKILL for workers that must end at once."""
 
 
 class WorkerResources:
@@ -252,10 +254,6 @@ class WorkerHandle:
     def close(self) -> None:
         """Close the sentinel's descriptor, once its last user lets go."""
         self._at_exit = None
-
-
-KILL_AFTER = 2.0
-"""Seconds between SIGTERM and SIGKILL for workers that must end at once."""
 
 
 class Launcher:

@@ -32,7 +32,7 @@ would never end by itself if somebody closed the descriptors.
 
 DOZE = 0.2
 """Seconds that a wait for the loop, on another thread, lasts at most at a time: so long a signal
-may be slept over that comes just before the sleep (``fiber._runtime.latch`` says why).
+may be slept over that comes just before the sleep (``fiber._runtime.threads`` says why).
 """
 
 _EVENTS = 128
