@@ -28,6 +28,7 @@ from fiber_operator.responses import (
     ListReader,
     Unavailable,
     document_of,
+    event_of,
     object_of,
 )
 
@@ -49,6 +50,12 @@ PAGE = 500
 """Objects of a page, where a list is read in pages."""
 
 READ_TIMEOUT = 30.0
+WATCH_SECONDS = 240
+"""Seconds after which the API server ends a watch."""
+WATCH_TIMEOUT = 300.0
+"""Seconds after which this client ends a watch that the API server has not ended."""
+SILENCE = 90.0
+"""Seconds without a byte after which a watch is taken for dead.  A bookmark comes each minute."""
 WRITE_TIMEOUT = 10.0
 """At most: a write has ended before another operator may begin."""
 CONNECT_TIMEOUT = 5.0
@@ -129,38 +136,45 @@ class Cluster:
         self, resource: ResourceType, namespace: str | None, keep: Callable[[Body], T]
     ) -> list[T]:
         """Return what ``keep`` makes of each object's metadata, which come in pages."""
+        kept: list[T] = []
+
+        def take(item: Body) -> None:
+            kept.append(keep(item))
+
         try:
-            return await self._pages(resource, namespace, keep, {"limit": str(PAGE)}, _METADATA)
+            await self._pages(resource, namespace, take, {"limit": str(PAGE)}, _METADATA)
         except Unavailable as error:
             if error.status != 410:
                 raise
-        # The next page was asked for too late.  A list without pages cannot be too late.
-        return await self._pages(resource, namespace, keep, {}, _METADATA)
+            # The next page was asked for too late.  A list without pages cannot be too late.
+            kept.clear()
+            await self._pages(resource, namespace, take, {}, _METADATA)
+        return kept
 
     async def _pages(
         self,
         resource: ResourceType,
         namespace: str | None,
-        keep: Callable[[Body], T],
+        take: Callable[[Body], object],
         query: dict[str, str],
         accept: str,
-    ) -> list[T]:
-        kept: list[T] = []
+    ) -> str:
+        """Call ``take`` with each object; return the version of the list."""
 
-        async def read(response: RESTResponse, what: str) -> str:
+        async def read(response: RESTResponse, what: str) -> tuple[str, str]:
             if not 200 <= response.status < 300:
                 await _document(response, what)  # raises what the status means
             listing = ListReader(response.response.content.iter_chunked(PIECE), what)
             async for item in listing:
-                kept.append(keep(item))
-            return listing.more()
+                take(item)
+            return listing.more(), listing.version()
 
         while True:
-            more = await self._call(
+            more, version = await self._call(
                 "list", resource, namespace, query=query, read=read, accept=accept
             )
             if not more:
-                return kept
+                return str(version)
             query["continue"] = more
 
     async def list(
@@ -172,14 +186,62 @@ class Cluster:
         selector: str = "",
         fields: str = "",
     ) -> list[T]:
-        """Return what ``keep`` makes of each object (``namespace`` None: of all namespaces).
+        """Return what ``keep`` makes of each object (``namespace`` None: of all namespaces)."""
+        kept: list[T] = []
+        query = {"labelSelector": selector, "fieldSelector": fields}
+        await self._pages(resource, namespace, lambda item: kept.append(keep(item)), query, _JSON)
+        return kept
+
+    async def list_all(
+        self,
+        resource: ResourceType,
+        namespace: str | None,
+        take: Callable[[Body], object],
+        *,
+        selector: str,
+    ) -> str:
+        """Call ``take`` with each object; return the version from which a watch goes on.
 
         In one piece: the API server answers that, and not a page, from what it has in memory, once
         it has made sure that this is the newest.  It need not read and decode all of a namespace
         for the few objects that are selected.
         """
-        query = {"labelSelector": selector, "fieldSelector": fields}
-        return await self._pages(resource, namespace, keep, query, _JSON)
+        return await self._pages(resource, namespace, take, {"labelSelector": selector}, _JSON)
+
+    async def watch(
+        self,
+        resource: ResourceType,
+        namespace: str | None,
+        take: Callable[[str, Body], object],
+        *,
+        selector: str,
+        version: str,
+        opened: Callable[[], object],
+    ) -> None:
+        """Call ``take`` with the type and the object of each event, until the watch ends.
+
+        ``opened`` is called once the API server has accepted the watch.  A version that the API
+        server has forgotten is an Unavailable with status 410.
+        """
+        query = {
+            "watch": "true",
+            "labelSelector": selector,
+            "resourceVersion": version,
+            "allowWatchBookmarks": "true",
+            "timeoutSeconds": str(WATCH_SECONDS),
+        }
+
+        async def read(response: RESTResponse, what: str) -> None:
+            if not 200 <= response.status < 300:
+                await _document(response, what)  # raises what the status means
+            opened()
+            rest = b""
+            async for piece in response.response.content.iter_any():
+                *lines, rest = (rest + piece).split(b"\n")
+                for line in lines:
+                    take(*event_of(line, what))
+
+        await self._call("watch", resource, namespace, query=query, read=read)
 
     async def create(
         self, resource: ResourceType, namespace: str, body: Body, *, dry_run: bool = False
@@ -243,7 +305,7 @@ class Cluster:
         shown = f"{resource.plural}/{subresource}" if subresource else resource.plural
         what = f"{verb} {shown} {name}".rstrip() + (f" in {namespace}" if namespace else "")
         async with self._turns.take(namespace or ""):
-            seconds = READ_TIMEOUT
+            seconds = WATCH_TIMEOUT if verb == "watch" else READ_TIMEOUT
             if verb in _WRITES:
                 seconds = min(WRITE_TIMEOUT, self._permit())
             started = time.perf_counter()
@@ -285,13 +347,16 @@ class Cluster:
             header_params=headers,
             auth_settings=["BearerToken"],
         )
-        timeout = aiohttp.ClientTimeout(total=seconds, sock_connect=CONNECT_TIMEOUT)
+        timeout = aiohttp.ClientTimeout(
+            total=seconds, sock_connect=CONNECT_TIMEOUT, sock_read=SILENCE
+        )
         return await self._client.call_api(method, url, headers, body, _request_timeout=timeout)
 
 
 _METHODS = {
     "get": "GET",
     "list": "GET",
+    "watch": "GET",
     "create": "POST",
     "update": "PUT",
     "patch": "PATCH",

@@ -1,15 +1,16 @@
 """Reconcile of one pool: read the pool and its pods, plan, and carry out the plan.
 
-The content of an event is not used: each pass reads the pool and its pods from the API server.
-While pods are being created, passes go on beside the creation, so that neither waits for the other.
-The process may die after any step and any step may fail; the next reconcile starts from what is in
-the cluster.
+Each pass reads the pool from the API server and takes its pods from the informer's cache.  While
+pods are being created, passes go on beside the creation, so that neither waits for the other.  The
+process may die after any step and any step may fail; the next reconcile starts from what is in the
+cluster.
 """
 
 from __future__ import annotations
 
 import asyncio
 import dataclasses
+import functools
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -23,6 +24,7 @@ from fiber_operator.cluster import PODS, POOLS, Cluster
 from fiber_operator.creation import Creation, CreationPace, Draw, Order, draw_suffix
 from fiber_operator.dependents import Dependents, DependentsReconciler
 from fiber_operator.events import EventRecorder, pod_warnings
+from fiber_operator.informer import PodInformer
 from fiber_operator.lease_monitor import LeaseMonitor, MasterLease
 from fiber_operator.logs import about
 from fiber_operator.metrics import Metrics, PoolSample
@@ -38,7 +40,7 @@ from fiber_operator.planning.plans import (
     PodRefusal,
     PoolEvent,
 )
-from fiber_operator.planning.pods import PodState, PodView, observe
+from fiber_operator.planning.pods import PodState, PodView
 from fiber_operator.responses import (
     ApiError,
     Body,
@@ -119,9 +121,6 @@ class Work:
     pool: FiberPool | None = None
     """None if the spec cannot be read."""
     plan: Plan = field(default_factory=Plan)
-    rested: float = 0.0
-    """Time of the loop's clock until which the pool rests from the list of its pods.  Pods may be
-    changed until then."""
 
 
 class Applier:
@@ -133,6 +132,7 @@ class Applier:
     def __init__(
         self,
         cluster: Cluster,
+        informer: PodInformer,
         *,
         draw: Draw,
         recorder: EventRecorder,
@@ -141,6 +141,7 @@ class Applier:
         requests: Mapping[str, str],
     ) -> None:
         self._cluster = cluster
+        self._informer = informer
         self._draw = draw
         self._recorder = recorder
         self._metrics = metrics
@@ -235,14 +236,13 @@ class Applier:
             work.creation.stop()
         deleted, as_planned = await self._delete(work)
         if deleted < len(work.plan.delete):
-            # Of a change an event tells; a pool that changes all the time is not looked at so.
+            # The pods or the pool have changed since: the watch shows it soon.
             return Result(requeue_after=0.0 if as_planned else GAP)
         if work.pool is not None and work.state.address is not None and work.plan.create:
             body = podspec.pod_maker(work.pool, work.state.address, self._requests)
-            container, limit = work.pool.spec.worker_container, work.plan.batch_limit
-            order = Order(work.plan.template_hash, body, container, limit)
+            order = Order(work.plan.template_hash, body, work.plan.batch_limit)
             work.creation.aim(work.plan.create, order)
-        return Result() if as_planned else Result(requeue_after=0.0)
+        return Result() if as_planned else Result(requeue_after=GAP)
 
     async def _delete(self, work: Work) -> tuple[int, bool]:
         """Delete pods; return how many were handled, and whether each was as the plan had it.
@@ -252,7 +252,7 @@ class Applier:
         key = work.key
         deletions = sorted(work.plan.delete, key=lambda deletion: deletion.may_work)
         clock = asyncio.get_running_loop().time
-        enough, done, as_planned = clock() + _enough(work), 0, True
+        enough, done, as_planned = clock() + ENOUGH, 0, True
         while done < len(deletions) and (not done or clock() < enough):
             batch = deletions[done : done + DELETIONS]
             if batch[-1].may_work and await self._has_changed(work):
@@ -289,13 +289,18 @@ class Applier:
         return _version(document) != _version(work.document)
 
     async def _delete_pod(self, namespace: str, deletion: Deletion) -> None:
-        await self._cluster.delete(
-            PODS,
-            namespace,
-            deletion.name,
-            uid=deletion.uid,
-            resource_version=deletion.resource_version,
-        )
+        try:
+            await self._cluster.delete(
+                PODS,
+                namespace,
+                deletion.name,
+                uid=deletion.uid,
+                resource_version=deletion.resource_version,
+            )
+        except Gone:
+            self._informer.deleted(namespace, deletion.uid, gone=True)
+            raise
+        self._informer.deleted(namespace, deletion.uid, gone=False)
 
     def _tell(self, work: Work, events: Sequence[PoolEvent]) -> None:
         for event in events:
@@ -308,11 +313,6 @@ def _version(document: Body) -> tuple[object, ...]:
     return tuple(metadata.get(key) for key in ("uid", "generation", "deletionTimestamp"))
 
 
-def _enough(work: Work) -> float:
-    """Seconds that may be spent on pods before the next reconcile."""
-    return max(ENOUGH, work.rested - asyncio.get_running_loop().time())
-
-
 def _some(pods: list[str]) -> str:
     more = f" and {len(pods) - 3} more" if len(pods) > 3 else ""
     return ", ".join(pods[:3]) + more
@@ -320,10 +320,6 @@ def _some(pods: list[str]) -> str:
 
 # -- Reconcile
 
-LIST_SHARE = 2.0
-"""A pool rests for this many times as long as the list of its pods took: what it does meanwhile
-is part of that."""
-LONGEST_REST = 10.0
 LONGEST = 60.0
 """Seconds for which one reconcile goes on while pods are being created."""
 OBSTRUCTED = 5.0
@@ -336,6 +332,7 @@ class Controller:
     def __init__(
         self,
         cluster: Cluster,
+        informer: PodInformer,
         *,
         lease_monitor: LeaseMonitor,
         recorder: EventRecorder,
@@ -345,11 +342,18 @@ class Controller:
         requests: Mapping[str, str],
     ) -> None:
         self._cluster = cluster
+        self._informer = informer
         self._lease_monitor = lease_monitor
         self._metrics = metrics
         self._dependents = DependentsReconciler(cluster, now)
         self._applier = Applier(
-            cluster, draw=draw, recorder=recorder, metrics=metrics, now=now, requests=requests
+            cluster,
+            informer,
+            draw=draw,
+            recorder=recorder,
+            metrics=metrics,
+            now=now,
+            requests=requests,
         )
         self._draw = draw
         self._now = now
@@ -390,7 +394,8 @@ class Controller:
         if found is None:
             return Result(forget=True)
         state = found[1]
-        creation = Creation(self._cluster, key, state.pace, self._draw)
+        expect = functools.partial(self._informer.created, key.namespace)
+        creation = Creation(self._cluster, key, state.pace, self._draw, expect)
         result = Result(failed=True)
         try:
             result = await self._passes(key, found, creation)
@@ -441,8 +446,7 @@ class Controller:
         try:
             work.pool = pool = FiberPool.read(work.document)
         except InvalidPool as error:
-            container = text(mapping(work.document, "spec").get("workerContainer"))
-            pods = await self._pods(work, container or names.WORKER_CONTAINER)
+            pods = await self._pods(work)
             now = self._now()
             work.plan = reconcile.plan_unreadable(work.document, pods, error.errors, now)
             return await self._act(work, pods)
@@ -453,7 +457,7 @@ class Controller:
         if pool.metadata.deletion_timestamp is None:
             state.dependents = await self._dependents.ensure(pool, state.dependents)
             failure = state.dependents.failure
-        pods = await self._pods(work, pool.spec.worker_container)
+        pods = await self._pods(work)
         plan = self._plan(work.key, pool, pods, state)
         if plan.inspect:
             # Not added to: what is not asked about any more may be over.
@@ -468,25 +472,17 @@ class Controller:
             raise failure
         return result
 
-    async def _pods(self, work: Work, container: str) -> list[PodView]:
-        """The pool's pods, from a fresh list, from which it rests then."""
-        clock, state = asyncio.get_running_loop().time, work.state
-        started = clock()
+    async def _pods(self, work: Work) -> list[PodView]:
+        """Return the pool's pods; if they are not known, say so in the status and raise why."""
+        state = work.state
         try:
-            listed = await self._cluster.list(
-                PODS,
-                work.key.namespace,
-                lambda pod: observe(pod, container),
-                selector=f"{names.LABEL_POOL_UID}={state.uid}",
-            )
+            pods = await self._informer.pods(work.key, state.uid)
         except ApiError as error:
             obstacle = messages.list_obstacle(error)
             work.plan = reconcile.plan_blind(work.document, obstacle, self._now())
             await self._applier.apply(work)
             raise
-        ended = clock()
-        work.rested = ended + min(LIST_SHARE * (ended - started), LONGEST_REST)
-        pods = work.creation.expect(listed, started)
+        work.creation.see(pods)
         there = {pod.name for pod in pods}
         state.warnings = {name: text for name, text in state.warnings.items() if name in there}
         return pods
@@ -520,13 +516,10 @@ class Controller:
         if dependents is not None and dependents.obstacles:
             wishes.append(OBSTRUCTED)
         again = min((max(wish, 0.0) for wish in wishes if wish is not None), default=None)
-        rest = work.rested - asyncio.get_running_loop().time()
         lull = bool(plan.create or plan.delete) or any(
             pod.state is not PodState.READY for pod in pods
         )
-        return dataclasses.replace(
-            result, requeue_after=again, rest=max(result.rest, rest), lull=lull
-        )
+        return dataclasses.replace(result, requeue_after=again, lull=lull)
 
     def _drop(self, key: Key) -> None:
         self._states.pop(key, None)

@@ -1,7 +1,7 @@
 """Creation of pods in batches of 1, 2, 4 and so on, each pod once.
 
-Creation runs while the controller lists the pool's pods and plans.  A list may lack pods that were
-created meanwhile, so ``Creation.expect`` adds them: the expectations of other controllers.
+Creation runs while the controller plans and writes the status.  The informer expects each pod from
+the moment in which its creation is answered.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 from fiber_api import names
 from fiber_operator.cluster import PODS, Cluster
-from fiber_operator.planning.pods import PodView, observe
+from fiber_operator.planning.pods import PodView
 from fiber_operator.responses import (
     ApiError,
     Body,
@@ -51,8 +51,6 @@ class Order:
     template_hash: str
     body: Callable[[str], Body]
     """The pod of that name."""
-    container: str
-    """The one that it is judged by."""
     limit: int
     """Number of pods that may be created at once."""
 
@@ -74,43 +72,41 @@ class Creation:
     """The pods of one pool that are being created, in batches of 1, 2, 4 ... up to a limit.
 
     A batch in which anything fails is the last, and the next time begins with one pod.
+    ``created`` is called with each pod that was created.
     """
 
     def __init__(
-        self, cluster: Cluster, key: Key, pace: CreationPace, draw: Draw = draw_suffix
+        self,
+        cluster: Cluster,
+        key: Key,
+        pace: CreationPace,
+        draw: Draw = draw_suffix,
+        created: Callable[[Body], object] = lambda document: None,
     ) -> None:
         self._cluster = cluster
         self._key = key
+        self._created = created
         self._pace = pace
         self._draw = draw
         self.order: Order
         self._left = 0
         """Pods that are still to be begun."""
         self._under_way: set[str] = set()
-        self._unlisted = 0
-        """Pods that were begun and that ``expect`` did not return."""
-        self._created: dict[str, tuple[float, PodView]] = {}
-        """Pods that no list has shown yet, and when they were there, by the loop's clock."""
+        self._unknown = 0
+        """Pods that were begun and that were not among those of the last ``see``."""
         self._task: asyncio.Task[None] | None = None
         self._done = Created()
 
-    def expect(self, listed: list[PodView], began: float) -> list[PodView]:
-        """``listed``, from a list that was asked for then, and what was created since."""
-        there = {pod.name for pod in listed}
+    def see(self, pods: list[PodView]) -> None:
+        """Note the pods that are there, before it is planned how many to create."""
+        there = {pod.name for pod in pods}
         self._pace.unsure = [name for name in self._pace.unsure if name not in there]
-        # What was there before and is not in the list is gone.
-        self._created = {
-            name: (at, pod)
-            for name, (at, pod) in self._created.items()
-            if at >= began and name not in there
-        }
-        self._unlisted = len(self._under_way - there)
-        return [*listed, *(pod for _, pod in self._created.values())]
+        self._unknown = len(self._under_way - there)
 
     def aim(self, count: int, order: Order) -> None:
-        """Create as many more as make ``count`` with those that ``expect`` did not return."""
+        """Create as many more as make ``count`` with those under way that ``see`` did not get."""
         self.order = order
-        self._left = max(0, count - self._unlisted)
+        self._left = max(0, count - self._unknown)
         if self._left and (self._task is None or self._task.done()):
             self._task = asyncio.create_task(self._run(), name=f"creation for {self._key}")
 
@@ -143,7 +139,7 @@ class Creation:
         while self._left and not (self._done.refusal or self._done.failure):
             size = min(self._pace.batch, self.order.limit, self._left)
             self._left -= size
-            self._unlisted += size
+            self._unknown += size
             batch = [self._name() for _ in range(size)]
             self._under_way.update(batch)
             results = await asyncio.gather(*map(self._create, batch), return_exceptions=True)
@@ -173,8 +169,7 @@ class Creation:
             raise
         else:
             self._done.names.append(name)
-            now = asyncio.get_running_loop().time()
-            self._created[name] = now, observe(document, self.order.container)
+            self._created(document)
         finally:
             self._under_way.discard(name)
 

@@ -3,9 +3,10 @@
 ::
 
     watches ───► work queue ──► controller ──► cluster
-    resync  ────►    ▲             │  ▲           ▲
-    master leases ───┘             ▼  │           │ permit
-                                 planning      leader election (may this process act?)
+    resync  ────►   ▲  ▲           │  ▲ ▲         ▲
+    master leases ──┘  │           ▼  │ │         │ permit
+                       │         planning │      leader election (may this process act?)
+    informer of pods ──┴──────────────────┘
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from fiber_operator.controller import Controller
 from fiber_operator.creation import Draw, draw_suffix
 from fiber_operator.events import EventRecorder
 from fiber_operator.health import Health, serving
+from fiber_operator.informer import PodInformer
 from fiber_operator.lease_monitor import LeaseMonitor
 from fiber_operator.metrics import Metrics
 from fiber_operator.operator_leases import Heartbeat, LeaderElector
@@ -73,6 +75,8 @@ class OperatorProcess:
                 await self._open(stack, settings.connections, permit=self._permit),
                 # For Leases alone, so that no queue of other calls keeps one from being renewed.
                 await self._open(stack, 2),
+                # For watches alone: each keeps a connection.
+                await self._open(stack, 2 * max(1, len(settings.namespaces))),
             )
             self.port = await stack.enter_async_context(
                 serving(
@@ -103,7 +107,7 @@ class OperatorProcess:
         stack.push_async_callback(cluster.close)
         return cluster
 
-    def _build(self, cluster: Cluster, lease_cluster: Cluster) -> None:
+    def _build(self, cluster: Cluster, lease_cluster: Cluster, watch_cluster: Cluster) -> None:
         settings, clock = self._settings, asyncio.get_running_loop().time
         self.elector = LeaderElector(
             lease_cluster,
@@ -117,8 +121,16 @@ class OperatorProcess:
         self.queue = WorkQueue(self._reconcile, concurrency=settings.concurrency)
         self.lease_monitor = LeaseMonitor(cluster, lambda key: self.queue.add(key, urgent=True))
         self.recorder = EventRecorder(cluster, self._now, settings.identity)
+        self.watches = WatchStatus(settings.namespaces)
+        self.informer = PodInformer(
+            watch_cluster,
+            namespaces=settings.namespaces,
+            changed=self._pods_changed,
+            answered=self.watches.answered,
+        )
         self.controller = Controller(
             cluster,
+            self.informer,
             lease_monitor=self.lease_monitor,
             recorder=self.recorder,
             metrics=self.metrics,
@@ -140,7 +152,6 @@ class OperatorProcess:
             serves=lambda namespace: self.elector.is_leader and self.resync.lists(namespace),
             wall_clock=self._now,
         )
-        self.watches = WatchStatus(settings.namespaces)
         self.health = Health(self.elector, self.queue, self.resync, self.watches, clock)
         self.metrics.watch_queue(self.queue.statistics, lambda: self.elector.is_leader)
 
@@ -161,6 +172,7 @@ class OperatorProcess:
             self.resync,
             self.heartbeat,
             self.recorder,
+            self.informer,
             watcher,
         ]
         tasks = [asyncio.ensure_future(part.run()) for part in parts]
@@ -181,15 +193,16 @@ class OperatorProcess:
             if isinstance(result, Exception):
                 raise result
 
-    def notice(self, key: Key, uid: str, generation: int | None) -> None:
-        """Something happened to a pool (``generation``: to the resource itself) or its pods."""
-        if not all(key):
-            return  # labelled by somebody who is not us
-        self.metrics.watched("pods" if generation is None else "fiberpools")
-        if generation is None:
-            self.queue.add(key)
-        elif self.controller.is_news(key, uid, generation):
+    def notice(self, key: Key, uid: str, generation: int) -> None:
+        """Reconcile a pool that was made, changed or deleted."""
+        self.metrics.watched("fiberpools")
+        if self.controller.is_news(key, uid, generation):
             self.queue.add(key, urgent=True)
+
+    def _pods_changed(self, key: Key) -> None:
+        self.metrics.watched("pods")
+        if all(key):  # else another program has set the labels
+            self.queue.add(key)
 
     def _renewed(self, namespace: str, lease: str, version: str, connected: int | None) -> None:
         self.metrics.watched("leases")
@@ -212,6 +225,7 @@ class OperatorProcess:
     def _lease_changed(self, held: bool) -> None:
         self.controller.forget()
         if held:
+            self.informer.refresh()
             # What happened while another operator acted was not looked at.
             self.resync.poke()
             for key in self.queue.known():

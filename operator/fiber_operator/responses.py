@@ -46,7 +46,13 @@ class ApiError(Exception):
     @property
     def writes(self) -> bool:
         """True if the call changes something, and so passes admission webhooks."""
-        return not self.call.startswith(("get ", "list "))
+        return not self.call.startswith(("get ", "list ", "watch "))
+
+    def again(self) -> ApiError:
+        """Return an equal error: one object that is raised twice keeps what raised it alive."""
+        error = type(self).__new__(type(self), *self.args)
+        vars(error).update(vars(self))
+        return error
 
 
 class Gone(ApiError):
@@ -104,6 +110,21 @@ def document_of(status: int, headers: Mapping[str, str], data: bytes, what: str)
         # Not shown: it may be half a Secret.
         raise Unavailable(f"the answer is no JSON object ({len(data)} bytes)", what=what)
     raise _error(status, headers, body if isinstance(body, dict) else {}, data, what)
+
+
+def event_of(line: bytes, what: str) -> tuple[str, Body]:
+    """Return the type and the object of an event of a watch; an error among them is raised."""
+    try:
+        event = json.loads(line)
+    except (ValueError, RecursionError):
+        event = None
+    kind, body = (event.get("type"), event.get("object")) if isinstance(event, dict) else ("", {})
+    if not isinstance(kind, str) or not isinstance(body, dict):
+        raise Unavailable("the answer is no event of a watch", what=what)
+    if kind == "ERROR":
+        code = body.get("code")
+        raise _error(code if isinstance(code, int) else 500, {}, body, b"", what)
+    return kind, body
 
 
 def _error(status: int, headers: Mapping[str, str], body: Body, data: bytes, what: str) -> ApiError:
@@ -180,6 +201,10 @@ class ListReader:
     def more(self) -> str:
         """Return the token of the next page; empty if this was the last."""
         return str(self.rest["metadata"].get("continue") or "")
+
+    def version(self) -> str:
+        """Return the version of the list, from which a watch goes on."""
+        return str(self.rest["metadata"].get("resourceVersion") or "")
 
     async def _objects(self) -> AsyncIterator[Body]:
         async for _ in self._parts("{", "}"):

@@ -48,7 +48,7 @@ from fiber_operator.workqueue import Key, WorkQueue
 log = logging.getLogger(__name__)
 
 
-WATCHED = (POOLS, PODS, LEASES)
+WATCHED = (POOLS, LEASES)
 
 _KEPT = ("namespace", "name", "uid", "generation", "resourceVersion")
 
@@ -113,16 +113,17 @@ class WatchStatus:
         self._needed = [
             f"watch {resource.plural}{where}"
             for where in ([f" in {namespace}" for namespace in namespaces] or [""])
-            for resource in WATCHED
+            for resource in (*WATCHED, PODS)
         ]
         self._running = False
         self._open: set[str] = set()
         self._failures: dict[str, str] = {}
 
     def started(self, running: bool) -> None:
-        """Watching begins, or ends."""
+        """kopf begins to watch, or ends."""
         self._running = running
-        self._open.clear()
+        # The informer watches the pods, and goes on.
+        self._open = {what for what in self._open if what.startswith(f"watch {PODS.plural}")}
 
     def answered(self, what: str, error: ApiError | None) -> None:
         """A list or a watch was answered."""
@@ -190,8 +191,8 @@ TOGETHER = 0.02
 END_WAIT = 4.0
 """Seconds for kopf to end; its thread does not keep the process from ending."""
 
-Notice = Callable[[Key, str, int | None], None]
-"""Told of a pool: its uid and generation if it is the pool itself that changed, else None."""
+Notice = Callable[[Key, str, int], None]
+"""Called with a pool that changed: its key, uid and generation (-1: it is deleted)."""
 
 Renewed = Callable[[str, str, str, int | None], None]
 """Told of a Lease of a pool: its namespace, name, resourceVersion (empty: it is deleted), and how
@@ -249,12 +250,6 @@ def registry(
         generation = -1 if type == "DELETED" else whole(metadata.get("generation"), -1)
         notice(key, text(metadata.get("uid")), generation)
 
-    @kopf.on.event("v1", "pods", registry=handlers)
-    async def pod_event(body: Mapping[str, Any], **_: Any) -> None:
-        metadata = mapping(body, "metadata")
-        name = text(mapping(metadata, "labels").get(names.LABEL_POOL))
-        notice(Key(text(metadata.get("namespace")), name), "", None)
-
     @kopf.on.event(LEASES.group, LEASES.version, LEASES.plural, registry=handlers)
     async def lease_event(type: str | None, body: Mapping[str, Any], **_: Any) -> None:
         metadata = mapping(body, "metadata")
@@ -283,9 +278,8 @@ def kopf_settings() -> kopf.OperatorSettings:
     settings.watching.inactivity_timeout = 90
     settings.watching.chunk_size = PAGE
     # Of the Leases of a namespace, and every node has one somewhere, those of masters.
-    for resource in (("v1", "pods"), LEASES):
-        settings.watching.label_selectors[resource] = names.LABEL_POOL_UID
-    # A handler of ours takes no time, and a task for each of a thousand pods is memory.
+    settings.watching.label_selectors[LEASES] = names.LABEL_POOL_UID
+    # A handler of ours takes no time, and a task for each of a thousand Leases is memory.
     settings.queueing.idle_timeout = 0.05
     settings.queueing.exit_timeout = 0.5
     settings.process.ultimate_exiting_timeout = None

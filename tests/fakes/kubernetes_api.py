@@ -253,6 +253,8 @@ class KubernetesApi:
             return
         selector = request.query.get("labelSelector", "")
         fields = request.query.get("fieldSelector", "")
+        clock = asyncio.get_running_loop().time
+        marked = clock()
         while True:
             for change in [change for change in self.store.changes if change.version > seen]:
                 seen = change.version
@@ -268,12 +270,13 @@ class KubernetesApi:
             if self.store.changes and self.store.changes[-1].version > seen:
                 continue  # it came while the last ones were written
             try:
-                async with asyncio.timeout(BOOKMARK_SECONDS + self.watch_delay):
+                async with asyncio.timeout_at(marked + BOOKMARK_SECONDS + self.watch_delay):
                     await self.store.changed()
                     await asyncio.sleep(self.watch_delay)
                 if self.silent:
                     await asyncio.Event().wait()
             except TimeoutError:
+                marked = clock()
                 mark = {"kind": "Bookmark", "metadata": {"resourceVersion": str(seen)}}
                 await response.write(line("BOOKMARK", mark))
 

@@ -59,7 +59,7 @@ class Feed:
         await self._gate()
         self._on_start(True)
         for where in [f" in {namespace}" for namespace in self._namespaces] or [""]:
-            for plural in ("fiberpools", "pods", "leases"):
+            for plural in ("fiberpools", "leases"):
                 self._answered(f"watch {plural}{where}", None)
         seen = 0
         while True:
@@ -74,9 +74,6 @@ class Feed:
                     self._notice(Key(namespace, name), metadata["uid"], generation)
                 elif "fiber.dev/pool-uid" not in metadata.get("labels", {}):
                     continue
-                elif plural == "pods":
-                    pool = metadata["labels"]["fiber.dev/pool"]
-                    self._notice(Key(namespace, pool), "", None)
                 elif plural == "leases":
                     gone = change.type == "DELETED"
                     version = "" if gone else metadata["resourceVersion"]

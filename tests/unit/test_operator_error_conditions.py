@@ -94,7 +94,6 @@ async def is_made_anew(world: World) -> None:
 LIVES: dict[Right, Callable[[World], Awaitable[None]]] = {
     ("create", "pods"): is_made_anew,
     ("delete", "pods"): releases,
-    ("list", "pods"): releases,
     ("create", "services"): is_made_anew,
     ("get", "services"): is_made_anew,
     ("patch", "services"): has_its_service_changed,
@@ -117,17 +116,20 @@ BY_EVENT = [("patch", "fiberpools/status")]
 BY_READINESS = [
     ("list", "fiberpools"),
     ("watch", "fiberpools"),
-    ("watch", "pods"),
     ("list", "leases"),
     ("watch", "leases"),
 ]
+AT_START = [("list", "pods"), ("watch", "pods")]
+"""What is told in the status of each pool by an operator that never had the right."""
 BY_LOG = [("get", "fiberpools")]
 EVENTS = [("create", "events"), ("list", "events"), ("patch", "events")]
 """Only an explanation is missing without these."""
 
 
 def test_every_right_is_in_one_of_these_tests() -> None:
-    assert sorted(rights()) == sorted([*LIVES, *BY_EVENT, *BY_READINESS, *BY_LOG, *EVENTS])
+    assert sorted(rights()) == sorted(
+        [*LIVES, *BY_EVENT, *BY_READINESS, *AT_START, *BY_LOG, *EVENTS]
+    )
 
 
 @pytest.mark.parametrize("right", LIVES, ids=" ".join)
@@ -150,6 +152,25 @@ def test_a_right_that_is_missing_is_told_in_the_status(right: Right) -> None:
         await world.until(
             lambda: not world.store.list("fiberpools") or "Forbidden" not in world.reasons(), 60
         )
+
+    test()
+
+
+@pytest.mark.parametrize("right", AT_START, ids=" ".join)
+def test_without_a_right_to_pods_the_operator_is_not_ready_and_pools_say_why(right: Right) -> None:
+    @played
+    async def test(world: World) -> None:
+        without = denied(right)
+        world.api.faults.append(without)
+        world.make_pool(replicas=2)
+        await world.until(lambda: "Forbidden" in world.reasons(), within=60)
+        (problem,) = (p for p in world.status()["problems"] if p["reason"] == "Forbidden")
+        assert f"cannot {right[0]} resource" in problem["message"]
+        assert f"{' '.join(right)}" in str(world.program.health.ready())
+        assert world.pods() == []
+        without.times = 0
+        await world.ready(2)
+        assert world.reasons() == []
 
     test()
 
@@ -338,6 +359,7 @@ async def test_nothing_is_planned_on_an_unknown_list_of_pods(world: World) -> No
     world.make_pool(replicas=3)
     await world.ready(3)
     world.api.faults.append(fault(("list", "pods"), status=500))
+    world.program.informer.refresh()
     world.edit(replicas=1)
     await world.until(lambda: "ApiUnavailable" in world.reasons(), within=2)
     status = world.status()

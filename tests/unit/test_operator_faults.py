@@ -112,6 +112,7 @@ async def test_long_trouble_is_got_over_within_a_minute(world: World) -> None:
         Fault("list", "fiberpools", times=10**6),
     ]
     world.api.faults += trouble
+    world.program.informer.refresh()
     await world.settled(1200)
     assert world.api.count("list", "pods") < 100
     for fault in trouble:
@@ -151,8 +152,10 @@ def test_a_list_that_is_none_makes_no_pods(text: str) -> None:
         await world.ready(5)
         fault = Fault("list", "pods", text=text, times=10**6)
         world.api.faults.append(fault)
+        world.program.informer.refresh()
         world.edit(replicas=6)
         await world.settled(120)
+        assert len(world.created()) == 5
         fault.times = 0
         await world.ready(6)
         assert len(world.created()) == 6
@@ -299,7 +302,7 @@ async def test_a_pool_made_anew_in_the_middle_gets_nothing_of_the_old_ones(world
     """Between the operator's read and its writes the pool is replaced by one of the same name."""
 
     def replace(call: Call) -> None:
-        if (call.verb, call.plural) == ("list", "pods"):
+        if (call.verb, call.plural) == ("get", "fiberpools"):
             world.api.after = lambda call: None
             world.store.delete("fiberpools", NAMESPACE, "es")
             world.make_pool(replicas=2)
@@ -347,10 +350,10 @@ NEW_TEMPLATE = {"spec": {"containers": [{"name": "worker", "image": "registry/wo
 @pytest.mark.parametrize(
     ("edit", "call", "attachment"),
     [
-        ({"template": NEW_TEMPLATE}, ("list", "pods"), {}),
-        ({"replicas": 10}, ("list", "pods"), {"replicas": 40}),
+        ({"template": NEW_TEMPLATE}, ("get", "fiberpools"), {}),
+        ({"replicas": 10}, ("get", "fiberpools"), {"replicas": 40}),
         ({"replicas": 10}, ("patch", "fiberpools"), {"replicas": 40}),
-        ({"replicas": 10}, ("list", "pods"), {}),
+        ({"replicas": 10}, ("get", "fiberpools"), {}),
     ],
     ids=["outdated", "fewer-wanted", "after-the-status", "fewer-wanted-still"],
 )
@@ -392,11 +395,12 @@ async def test_what_is_released_goes_though_the_pool_changes_all_the_time(world:
     world.make_pool(replicas=5, master=MASTER, update={"strategy": "Recreate"})
     await world.ready(5)
     released = world.names()[2]
-    world.slow("list", "pods", 0.1)
+    world.slow("get", "fiberpools", 0.1)
 
     def change(call: Call) -> None:
-        if (call.verb, call.plural) == ("list", "pods"):
-            world.edit(failurePolicy={"backoffBaseSeconds": 1 + world.api.count("list", "pods")})
+        if (call.verb, call.plural) == ("get", "fiberpools"):
+            looks = world.api.count("get", "fiberpools")
+            world.edit(failurePolicy={"backoffBaseSeconds": 1 + looks})
 
     world.api.after = change
     world.edit(template=NEW_TEMPLATE, scaleDown={"release": [released]})

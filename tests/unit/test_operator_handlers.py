@@ -16,7 +16,6 @@ from kopf._core.intents.causes import Activity
 
 from fakes import virtual_time
 from fakes.kubernetes_api import Fault
-from fakes.store import Body
 from fakes.world import NAMESPACE, World, a_world, configuration
 from fiber_api import names
 from fiber_operator import watches
@@ -28,8 +27,8 @@ from fiber_operator.watches import KopfThread
 from fiber_operator.workqueue import Key
 
 ES = Key(NAMESPACE, "es")
-Notice = tuple[Key, str, int | None]
-WATCHED = ("fiberpools", "pods", "leases")
+Notice = tuple[Key, str, int]
+WATCHED = ("fiberpools", "leases")
 
 
 class Watching:
@@ -84,11 +83,6 @@ class Watching:
             lambda: min(self.api.count("watch", plural) for plural in WATCHED) >= times
         )
 
-    def pod(self, name: str, namespace: str = NAMESPACE, pool: str = "es") -> Body:
-        labels = {"fiber.dev/pool": pool, "fiber.dev/pool-uid": "1"}
-        body = {"metadata": {"name": name, "labels": labels}, "spec": {}}
-        return self.store.create("pods", namespace, body)
-
 
 @contextlib.asynccontextmanager
 async def watching(*namespaces: str) -> AsyncIterator[Watching]:
@@ -117,16 +111,12 @@ def played(*namespaces: str) -> Callable[[Callable[[Watching], Coroutine[Any, An
 
 
 @played()
-async def test_pools_and_their_pods_are_told(kopf: Watching) -> None:
+async def test_pools_are_told(kopf: Watching) -> None:
     pool = kopf.world.make_pool()
     uid = pool["metadata"]["uid"]
     assert (ES, uid, 1) in await kopf.told(ES)
     kopf.world.edit(replicas=2)
     assert (ES, uid, 2) in await kopf.told(ES)
-    kopf.pod("a")
-    assert (ES, "", None) in await kopf.told(ES)
-    kopf.store.delete("pods", NAMESPACE, "a")
-    assert (ES, "", None) in await kopf.told(ES)
     kopf.store.delete("fiberpools", NAMESPACE, "es")
     assert (ES, uid, -1) in await kopf.told(ES)
 
@@ -146,16 +136,8 @@ async def test_lists_and_watches_ask_for_metadata_alone(kopf: Watching) -> None:
 @played()
 async def test_what_was_there_before_is_told(kopf: Watching) -> None:
     kopf.world.make_pool()
-    kopf.pod("a", pool="another")
+    kopf.world.make_pool("another")
     await kopf.told(ES, Key(NAMESPACE, "another"))
-
-
-@played()
-async def test_other_pods_are_not_asked_for(kopf: Watching) -> None:
-    await kopf.watched()
-    kopf.store.create("pods", NAMESPACE, {"metadata": {"name": "stranger"}})
-    kopf.pod("ours")
-    assert {key for key, _, _ in await kopf.told(ES)} == {ES}
 
 
 @played()
@@ -181,7 +163,6 @@ async def test_renewals_of_the_masters_leases_are_told_and_of_no_others(kopf: Wa
 async def test_kopf_writes_nothing(kopf: Watching) -> None:
     marks = {"kopf.zalando.org/last-handled-configuration": "{nonsense"}
     kopf.store.create("fiberpools", NAMESPACE, {"metadata": {"name": "es", "annotations": marks}})
-    kopf.pod("a")
     await kopf.told(ES)
     kopf.world.edit(replicas=1)
     await kopf.told(ES)
@@ -193,9 +174,8 @@ async def test_kopf_writes_nothing(kopf: Watching) -> None:
 
 @played("one", "two")
 async def test_only_the_given_namespaces_are_asked_for(kopf: Watching) -> None:
-    kopf.pod("a", "one")
-    kopf.pod("b", "two")
-    kopf.pod("c", "three")
+    for namespace in ("one", "two", "three"):
+        kopf.world.make_pool(namespace=namespace)
     await kopf.told(Key("one", "es"), Key("two", "es"))
     assert {call.namespace for call in kopf.api.calls} == {"one", "two"}
 

@@ -39,7 +39,7 @@ def test_a_pool_that_two_operators_serve_has_a_warning(caplog: pytest.LogCapture
         async with a_world() as world, another_release(world):
             world.slow("create", "pods", 0.2)
             # One of the two is half a second behind, as no two programs are in step.
-            world.api.faults.append(Fault("list", "pods", late=0.5))
+            world.api.faults.append(Fault("get", "fiberpools", late=0.5))
             world.make_pool(replicas=20)
             await world.until(lambda: bool(warnings(world)), within=60)
         (said, *_) = warnings(world)

@@ -56,7 +56,7 @@ class Trouble(StrEnum):
     """No node takes it now; the scheduler retries, so the pod is kept."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class PodView:
     """View of a pod.  Times are unix seconds as the cluster wrote them; 0.0 where it wrote none."""
 
@@ -102,6 +102,20 @@ class PodView:
 def observe(pod: Mapping[str, Any], container: str) -> PodView:
     """Return the view of ``pod``, judged by its container of that name.  Never raises."""
     return _Observation(pod, container).view()
+
+
+def worker_container(pod: Mapping[str, Any]) -> str:
+    """Return the name of the container with the agent: the one that knows where to dial."""
+    dialing = [
+        text(container.get("name"))
+        for container in items(mapping(pod, "spec").get("containers"))
+        if any(
+            variable.get("name") == names.ENV_ADDRESS for variable in items(container.get("env"))
+        )
+    ]
+    if dialing and names.WORKER_CONTAINER not in dialing:
+        return dialing[0]
+    return names.WORKER_CONTAINER
 
 
 # The kubelet's words for a container that waits though nothing is on its way.  It goes on trying.

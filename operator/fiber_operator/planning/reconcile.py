@@ -198,7 +198,7 @@ _ENDED: Mapping[Trouble | None, Reason] = {
 def plan(pool: FiberPool, pods: Sequence[PodView], knowledge: Knowledge, now: float) -> Plan:
     """Plan the work that brings the cluster nearer to ``pool``.
 
-    ``pods`` are all pods with the label of the pool's uid, from a fresh list; those that another
+    ``pods`` are all pods with the label of the pool's uid, from the informer; those that another
     controller owns are ignored.  Pure and total: the same arguments give an equal plan, and
     nothing that can stand in ``pods`` or in the pool's status makes it raise.
     """

@@ -1,0 +1,306 @@
+"""Cache of the workers' pods, fed by a list and by a watch from that list on.
+
+::
+
+    API server ──list, watch──► PodInformer ──changed(pool)──► queue
+                                  ▲     │
+           created, deleted ──────┘     └──pods(pool)────────► controller
+
+A watch may be behind what this operator did itself.  So the controller tells the informer what to
+expect: a pod that it created is in the cache from then on, and a pod that it deleted counts as
+terminating, whatever the watch still shows.  Kubernetes' own controllers call this expectations.
+
+A watch that breaks off goes on where it was.  Where the API server has forgotten that moment (410
+Gone), the pods are listed again, and the list replaces the cache: a pod that is not in it is gone.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import logging
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+from fiber_api import names
+from fiber_operator.cluster import PODS, Cluster
+from fiber_operator.planning.documents import mapping, text
+from fiber_operator.planning.pods import PodState, PodView, observe, worker_container
+from fiber_operator.responses import ApiError, Body, Refused, Unavailable
+from fiber_operator.watches import Answered
+from fiber_operator.workqueue import Key
+
+PAUSES = (0.5, 1.0, 2.0, 5.0, 15.0)
+"""Seconds until the next attempt, after one, two … attempts that failed."""
+SYNC_TIMEOUT = 30.0
+"""Seconds for which a reconcile waits for the first list."""
+CONFIRMED_WITHIN = 30.0
+"""Seconds within which the watch shows a created pod.  After that the pods are listed again."""
+REMEMBERED = 1000
+"""Number of deleted pods whose uids are kept: the answer to a creation may come after the end."""
+
+_SELECTOR = names.LABEL_POOL_UID
+
+log = logging.getLogger(__name__)
+
+
+class PodInformer:
+    """Cache of the pods of ``namespaces`` (empty: all) that belong to pools.
+
+    ``changed`` is called with the pool of each pod that has changed, ``answered`` with what the
+    API server answers to each watch.  Everything runs in one event loop.
+    """
+
+    def __init__(
+        self,
+        cluster: Cluster,
+        *,
+        namespaces: Sequence[str],
+        changed: Callable[[Key], None],
+        answered: Answered = lambda what, error: None,
+    ) -> None:
+        self._reflectors: dict[str | None, _Reflector] = {
+            namespace: _Reflector(cluster, namespace, changed, answered)
+            for namespace in namespaces or (None,)
+        }
+
+    async def run(self) -> None:
+        """Keep the cache until cancelled."""
+        async with asyncio.TaskGroup() as group:
+            for reflector in self._reflectors.values():
+                group.create_task(reflector.run())
+
+    def refresh(self) -> None:
+        """List the pods again before any are returned: another operator may have acted."""
+        for reflector in self._reflectors.values():
+            reflector.refresh()
+
+    async def pods(self, key: Key, uid: str) -> list[PodView]:
+        """Return the pods of the pool with that uid; raise ApiError if they are not known."""
+        return await self._of(key.namespace).pods(uid)
+
+    def created(self, namespace: str, document: Body) -> None:
+        """Expect a pod that this operator has created."""
+        self._of(namespace).created(document)
+
+    def deleted(self, namespace: str, uid: str, *, gone: bool) -> None:
+        """Expect the end of a pod that this operator has deleted.  ``gone``: it has ended."""
+        self._of(namespace).deleted(uid, gone=gone)
+
+    def _of(self, namespace: str) -> _Reflector:
+        return self._reflectors.get(namespace) or self._reflectors[None]
+
+
+class _Known(NamedTuple):
+    """Pod in the cache."""
+
+    key: Key
+    pool: str
+    """The uid of the pool."""
+    view: PodView
+
+
+class _Reflector:
+    """Cache of the pods of one namespace (None: of all), as the API server shows them."""
+
+    def __init__(
+        self,
+        cluster: Cluster,
+        namespace: str | None,
+        changed: Callable[[Key], None],
+        answered: Answered,
+    ) -> None:
+        self._cluster = cluster
+        self._namespace = namespace
+        self._changed = changed
+        self._answered = answered
+        self._pods: dict[str, _Known] = {}
+        """Pods by uid."""
+        self._pools: dict[str, dict[str, PodView]] = {}
+        """The same pods: uid of the pool -> uid of the pod -> view."""
+        self._expected: dict[str, float] = {}
+        """Pods that were created and that the watch has not shown: uid -> time of the event loop.
+        The oldest is the first."""
+        self._ending: set[str] = set()
+        """The uids of pods that this operator has deleted and that the watch has not ended."""
+        self._gone: OrderedDict[str, None] = OrderedDict()
+        self._version = ""
+        """Version that the watch goes on from.  Empty: the pods must be listed."""
+        self._refreshes = 0
+        self._settled = asyncio.Event()
+        """Set once the pods are known, or known not to be available."""
+        self._failure: ApiError | None = None
+        self._failures = 0
+        """Attempts that failed since the last one that succeeded."""
+        self._watching: asyncio.Timeout | None = None
+
+    async def pods(self, uid: str) -> list[PodView]:
+        try:
+            async with asyncio.timeout(SYNC_TIMEOUT):
+                await self._settled.wait()
+        except TimeoutError:
+            raise Unavailable("the pods were not listed in time", what="list pods") from None
+        if self._failure is not None:
+            raise self._failure.again()
+        return list(self._pools.get(uid, {}).values())
+
+    def refresh(self) -> None:
+        self._version = ""
+        self._refreshes += 1
+        self._settled.clear()
+        if self._watching is not None:
+            self._watching.reschedule(_now())
+
+    # What the operator does itself
+
+    def created(self, document: Body) -> None:
+        uid = text(mapping(document, "metadata").get("uid"))
+        if uid not in self._pods and uid not in self._gone:
+            self._expected[uid] = _now()
+            self._keep(document)
+
+    def deleted(self, uid: str, *, gone: bool) -> None:
+        if gone:
+            self._drop(uid)
+        elif known := self._pods.get(uid):
+            self._ending.add(uid)
+            self._put(uid, known._replace(view=_as_ending(known.view)))
+
+    # What the API server shows
+
+    async def run(self) -> None:
+        while True:
+            try:
+                await self._follow()
+            except ApiError as error:
+                if error.status == 410:
+                    self._version = ""
+                    continue
+                # A watch that breaks off once is begun again, and the pods are known meanwhile.
+                if self._failures or isinstance(error, Refused):
+                    self._failure, self._version = error, ""
+                    self._settled.set()
+                self._answered(self._what("watch"), error)
+                pause = PAUSES[min(self._failures, len(PAUSES) - 1)]
+                self._failures += 1
+                await asyncio.sleep(pause)
+
+    async def _follow(self) -> None:
+        """List if need be, and watch until the watch ends."""
+        while not self._version:
+            await self._list()
+        with_limit = asyncio.timeout(None)
+        try:
+            async with with_limit as self._watching:
+                await self._cluster.watch(
+                    PODS,
+                    self._namespace,
+                    self._take,
+                    selector=_SELECTOR,
+                    version=self._version,
+                    opened=self._opened,
+                )
+        except TimeoutError:
+            if not with_limit.expired():
+                raise
+        finally:
+            self._watching = None
+
+    def _opened(self) -> None:
+        self._failure, self._failures = None, 0
+        self._settled.set()
+        self._answered(self._what("watch"), None)
+
+    def _what(self, verb: str) -> str:
+        return f"{verb} {PODS.plural}" + (f" in {self._namespace}" if self._namespace else "")
+
+    async def _list(self) -> None:
+        began, refreshes = _now(), self._refreshes
+        listed: set[str] = set()
+
+        def keep(document: Body) -> None:
+            listed.add(self._show(document))
+
+        version = await self._cluster.list_all(PODS, self._namespace, keep, selector=_SELECTOR)
+        for uid in [uid for uid in self._pods if uid not in listed]:
+            # A pod that was created since then may be missing from the list.
+            if self._expected.get(uid, -1.0) < began:
+                self._drop(uid)
+        if refreshes == self._refreshes:
+            self._version = version
+            if self._failure is None:
+                self._settled.set()
+
+    def _take(self, kind: str, document: Body) -> None:
+        """Take one event of the watch."""
+        metadata = mapping(document, "metadata")
+        self._version = text(metadata.get("resourceVersion")) or self._version
+        if kind == "DELETED":
+            self._drop(text(metadata.get("uid")))
+        elif kind in ("ADDED", "MODIFIED"):
+            self._show(document)
+        oldest = next(iter(self._expected.values()), None)
+        if oldest is not None and _now() - oldest > CONFIRMED_WITHIN:
+            self.refresh()
+
+    def _show(self, document: Body) -> str:
+        """Keep a pod that the API server shows; return its uid."""
+        uid = text(mapping(document, "metadata").get("uid"))
+        if not uid:
+            raise Unavailable("a pod has no uid", what=self._what("watch"))
+        self._expected.pop(uid, None)
+        self._keep(document)
+        return uid
+
+    # The cache
+
+    def _keep(self, document: Body) -> None:
+        metadata = mapping(document, "metadata")
+        labels = mapping(metadata, "labels")
+        view = observe(document, worker_container(document))
+        if view.uid in self._ending:
+            view = _as_ending(view)
+        key = Key(text(metadata.get("namespace")), text(labels.get(names.LABEL_POOL)))
+        known = _Known(key, text(labels.get(names.LABEL_POOL_UID)), view)
+        before = self._pods.get(view.uid)
+        if before is not None and before.pool != known.pool:
+            self._drop(view.uid)
+        self._put(view.uid, known)
+        if before is None or not _same(before.view, view):
+            self._changed(key)
+
+    def _put(self, uid: str, known: _Known) -> None:
+        self._pods[uid] = known
+        self._pools.setdefault(known.pool, {})[uid] = known.view
+
+    def _drop(self, uid: str) -> None:
+        self._expected.pop(uid, None)
+        self._ending.discard(uid)
+        self._gone[uid] = None
+        if len(self._gone) > REMEMBERED:
+            self._gone.popitem(last=False)
+        known = self._pods.pop(uid, None)
+        if known is not None:
+            pods = self._pools[known.pool]
+            del pods[uid]
+            if not pods:
+                del self._pools[known.pool]
+            self._changed(known.key)
+
+
+def _now() -> float:
+    return asyncio.get_running_loop().time()
+
+
+def _as_ending(view: PodView) -> PodView:
+    if not view.live:
+        return view
+    return dataclasses.replace(
+        view, state=PodState.TERMINATING, trouble=None, reason="", message=""
+    )
+
+
+def _same(one: PodView, other: PodView) -> bool:
+    """Tell whether the views differ in nothing but their version."""
+    return dataclasses.replace(one, resource_version=other.resource_version) == other
