@@ -107,7 +107,7 @@ def test_the_error_of_a_task_that_sends_wrong_answers_says_so(rig: Rig) -> None:
     error = results.outcomes[0].error
     assert isinstance(error, WorkerDied)
     assert error.reason.startswith("WrongAnswer: it answered for batch")
-    assert "What to do: only Fiber itself writes to the channel of a worker" in str(error)
+    assert "What to do: only Fiber may write to the channel of a worker" in str(error)
 
 
 # What an agent says of the end of a worker
