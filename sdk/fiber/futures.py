@@ -276,7 +276,7 @@ ProcessPoolExecutor = Executor
 
 
 class CallFuture(Future[_T]):
-    """Future of one call, which an executor uses as a ``work_items.Cancellable``.
+    """Future of one call, which an executor uses as a ``work_items.CancellableFuture``.
 
     The user's code, unpicklers and callbacks, does not run on the loop thread.
     """

@@ -280,7 +280,7 @@ class _ResultBuffer:
         self._sizes.append((self._passed, size))
 
     def consumed(self) -> int:
-        """Return the number of results that the user took.  On the loop's thread."""
+        """Return the number of results that the user took.  On the loop thread."""
         return self._passed - len(self.items)
 
     def _is_full(self) -> bool:

@@ -18,7 +18,7 @@ from fiber._wire import work
 from fiber._wire.memory_files import BytesLike
 from fiber._wire.packet import Message
 
-Words: TypeAlias = tuple[Any, ...]
+MessageFields: TypeAlias = tuple[Any, ...]
 """Content of a worker's message.  Results are (seq, offset, kept, seconds, values, mixed, size).
 ``mixed``: some values are ``Pickled``.  ``size``: bytes of the message."""
 
@@ -120,18 +120,18 @@ def single(message: Message, seq: int) -> Any:
     return OTHER
 
 
-def read(message: Message) -> Words:
+def read(message: Message) -> MessageFields:
     """Read and check a message.  All but results keep the form of ``fiber._wire.work``.
 
     Raise WrongAnswer for a message that no worker sends.  It can be read again until its release.
     """
     try:
-        words = pickle.loads(message.payload)
-        if type(words[0]) is not int:
-            if type(words) is tuple and _FORMS[words[0]](*words[1:]):
-                return words
+        fields = pickle.loads(message.payload)
+        if type(fields[0]) is not int:
+            if type(fields) is tuple and _FORMS[fields[0]](*fields[1:]):
+                return fields
             raise ValueError("it has another form")
-        seq, offset, kept, seconds, values, odd = words
+        seq, offset, kept, seconds, values, odd = fields
         if (
             type(offset) is not int
             or offset < 0

@@ -14,7 +14,7 @@ from itertools import chain
 from fiber import reduction
 from fiber._engine.scheduler import Scheduler
 from fiber._engine.tasks import Batch, Job, WorkerEntry, WrongAnswer
-from fiber._runtime.answers import Pickled, TaskFailure, Words, read
+from fiber._runtime.answers import MessageFields, Pickled, TaskFailure, read
 from fiber._runtime.jobs import Jobs
 from fiber._runtime.leases import LeasedWorker, Leases
 from fiber._runtime.threads import BackgroundThread, say
@@ -245,11 +245,14 @@ class TimeLimits:
         handle: WorkerHandle = batch.worker.key
         self._ledger.retire(batch.worker)
         self._scheduler.let_go(handle)
-        self._ending[handle] = seq, self._loop.call_later(STACK_PATIENCE, self._unheard, handle)
+        self._ending[handle] = (
+            seq,
+            self._loop.call_later(STACK_PATIENCE, self._stacks_overdue, handle),
+        )
         handle.kill_with_stack()
         self._advance()
 
-    def _unheard(self, handle: WorkerHandle) -> None:
+    def _stacks_overdue(self, handle: WorkerHandle) -> None:
         """Fail the task without stacks: the worker's host is slow, or does not answer."""
         self.exited(handle, "")
         handle.kill()
@@ -354,27 +357,27 @@ class AnswerReceiver:
             if not handle.fault:  # else it was killed for an earlier one
                 self._take(handle, read(message))
         except WrongAnswer as error:
-            self._convict(handle, str(error))
+            self._kill(handle, str(error))
         finally:
             message.release()
 
-    def _take(self, handle: WorkerHandle, words: Words) -> None:
-        if type(words[0]) is int:
+    def _take(self, handle: WorkerHandle, fields: MessageFields) -> None:
+        if type(fields[0]) is int:
             if handle.worker is not None and handle.worker.leased:
-                self._leases.keep_answer(handle, words)
+                self._leases.keep_answer(handle, fields)
             else:
-                self._answered(handle, words)
-        elif words[0] == work.READY:
+                self._answered(handle, fields)
+        elif fields[0] == work.READY:
             self._on_ready(handle)
-        elif words[0] == work.INIT_FAILED:
-            handle.complain(words[1])
-        elif words[0] == work.UNKNOWN:
-            batch = self._held(handle, words[1])
+        elif fields[0] == work.INIT_FAILED:
+            handle.note_init_error(fields[1])
+        elif fields[0] == work.UNKNOWN:
+            batch = self._held(handle, fields[1])
             if batch is not None and batch.has_function:
                 raise WrongAnswer(f"it did not know the function that came with batch {batch.seq}")
-            self.recalled(handle, [words[1]])
+            self.recalled(handle, [fields[1]])
         else:
-            kind, seq, error = words
+            kind, seq, error = fields
             batch = self._held(handle, seq)
             if batch is not None:
                 self._unreadable(kind, batch, Pickled(work.ERROR, error, ()))
@@ -385,11 +388,11 @@ class AnswerReceiver:
             raise WrongAnswer(_NOT_READY.format(seq))
         return self._ledger.held(handle.worker, seq)
 
-    def _convict(self, handle: WorkerHandle, reason: str) -> None:
+    def _kill(self, handle: WorkerHandle, reason: str) -> None:
         """Kill a worker that sent a wrong answer; its tasks run elsewhere once it is gone."""
         if handle.worker is not None:
             self._ledger.retire(handle.worker)
-        handle.convict(reason)
+        handle.kill_for(reason)
         with contextlib.suppress(RuntimeError):  # the system has no room for its thread
             self._background.submit(say, f"pool worker {handle.name!r} is killed: {reason}")
         self._advance()
@@ -400,11 +403,11 @@ class AnswerReceiver:
             try:
                 self._answered(worker.handle, worker.answer)
             except WrongAnswer as error:
-                self._convict(worker.handle, str(error))
+                self._kill(worker.handle, str(error))
         if worker.unread:
             self.recalled(worker.handle, worker.unread)
 
-    def _answered(self, handle: WorkerHandle, results: Words) -> None:
+    def _answered(self, handle: WorkerHandle, results: MessageFields) -> None:
         seq, offset, kept, seconds, values, mixed, size = results
         if handle.worker is None:
             raise WrongAnswer(_NOT_READY.format(seq))

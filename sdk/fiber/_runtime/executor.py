@@ -43,8 +43,8 @@ from fiber._runtime.work_items import (
     Call,
     Function,
     FunctionCache,
-    Future,
     InputStream,
+    TaskFuture,
     WorkItem,
     pickle_call,
 )
@@ -55,7 +55,7 @@ from fiber._wire.packet import Message
 from fiber.errors import FiberError
 
 
-class Waitable(Future, Protocol):
+class Waitable(TaskFuture, Protocol):
     """Future that a thread can wait for."""
 
     def get(self) -> Any:
@@ -174,7 +174,7 @@ class PoolExecutor:
 
     def call(
         self,
-        future: Future,
+        future: TaskFuture,
         function: Callable[..., Any],
         args: Iterable[Any],
         kwargs: Mapping[str, Any],
@@ -220,14 +220,16 @@ class PoolExecutor:
             item = WorkItem(work.CALLS, timeout=timeout)
             self._loop.call_soon(self._take, item, (call,))
 
-    def broadcast(self, future: Future, function: Callable[..., Any], args: Sequence[Any]) -> None:
+    def broadcast(
+        self, future: TaskFuture, function: Callable[..., Any], args: Sequence[Any]
+    ) -> None:
         """Submit a call to every worker, ready or starting; ``future`` gets an outcome of each."""
         call = pickle_call(future, function, args, {}, self.reject)
         if call is not None:
             self._check()
             self._loop.call_soon(self._broadcast, WorkItem(work.CALLS, future=future), call)
 
-    def reject(self, future: Future, error: BaseException) -> None:
+    def reject(self, future: TaskFuture, error: BaseException) -> None:
         """Fail ``future``, whose call cannot begin.  The loop thread sets it, as always."""
         self._check()
         self._loop.call_soon(future.set_exception, error)

@@ -27,7 +27,7 @@ from typing import Any
 from fiber._agent.interface import DirectChannel, ExitReport
 from fiber._engine.scheduler import Scheduler
 from fiber._engine.tasks import WrongAnswer
-from fiber._runtime.answers import OTHER, Words, read, single
+from fiber._runtime.answers import OTHER, MessageFields, read, single
 from fiber._runtime.work_items import Call
 from fiber._runtime.workers import WorkerHandle
 from fiber._transport.loop import Loop, LoopTimer
@@ -64,7 +64,7 @@ class LeasedWorker:
         self.handle = handle
         self.seq = 0
         """Number of the last call that a caller sent it."""
-        self.answer: Words | None = None
+        self.answer: MessageFields | None = None
         """Last packet of a worker that died, received by the agent and not by the caller."""
         self.unread: list[int] = []
         """Calls that the worker gave back, before they are batches of the ledger."""
@@ -77,14 +77,14 @@ class LeasedWorker:
 class Lease:
     """Right of one thread at a time to send a worker calls."""
 
-    __slots__ = ("__weakref__", "channel", "surprise", "used", "worker")
+    __slots__ = ("__weakref__", "channel", "unexpected", "used", "worker")
 
     def __init__(self, worker: LeasedWorker, channel: DirectChannel) -> None:
         self.worker = worker
         self.channel = channel
         self.used = True
         """True if a caller used it since the last look."""
-        self.surprise: Message | None = None
+        self.unexpected: Message | None = None
         """Message of its worker that is not the answer; the loop judges it."""
 
 
@@ -153,7 +153,7 @@ class Leases:
                 return ADOPTED
             result = single(message, seq)
             if result is OTHER and not self._is_late(message, seq):
-                lease.surprise = message
+                lease.unexpected = message
                 return ADOPTED
             message.release()
             if result is not OTHER:
@@ -224,9 +224,9 @@ class Leases:
 
     # What happens to a worker while a caller uses it counts once the worker is back
 
-    def keep_answer(self, handle: WorkerHandle, words: Words) -> None:
+    def keep_answer(self, handle: WorkerHandle, fields: MessageFields) -> None:
         """Keep an answer of a leased worker until the worker is back."""
-        self._workers[handle].answer = words
+        self._workers[handle].answer = fields
 
     def keep_unread(self, handle: WorkerHandle, seqs: list[int]) -> None:
         """Keep calls that a leased worker gave back: a recall from before the lease took them."""
@@ -277,8 +277,8 @@ class Leases:
         # First the task that the answer belongs to: the answer may be there already.
         self._on_adopted(worker, call)
         self._end(lease)
-        if lease.surprise is not None:
-            worker.handle.received(lease.surprise)
+        if lease.unexpected is not None:
+            worker.handle.received(lease.unexpected)
         self._back(worker)
 
     def _abandon(self, lease: Lease) -> None:

@@ -307,7 +307,7 @@ def shutdown() -> None:
 
 
 def _forget() -> None:
-    """Forget the runtime after a fork without Fiber: the loop's thread is not in the copy."""
+    """Forget the runtime after a fork without Fiber: the loop thread is not in the copy."""
     global _runtime, _lock, _may_link
     _runtime, _lock = None, threading.RLock()
     _may_link = _may_link and "fiber._transport.nng" not in sys.modules

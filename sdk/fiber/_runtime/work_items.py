@@ -220,14 +220,14 @@ class InputStream:
         self._credit.put(0)
 
 
-class Future(Protocol):
+class TaskFuture(Protocol):
     """Receiver of the outcomes of a work item, or of one call.  Runs on the loop thread."""
 
     def add_results(self, start: int, outcomes: list[Any], mixed: bool, size: int = 0) -> bool:
         """Take the outcomes of the tasks from ``start`` on.  Batches come in any order, each once.
 
         Unless ``mixed``, all outcomes are plain values.  They came in ``size`` bytes.  Return True
-        to pause the job because no user reads the results; ``Executor.resume`` ends the pause.
+        to pause the job because no user reads the results; ``PoolExecutor.resume`` ends the pause.
         """
 
     def has_room(self) -> bool:
@@ -243,7 +243,7 @@ class Future(Protocol):
         """End the outcomes with ``error``."""
 
 
-class Cancellable(Future, Protocol):
+class CancellableFuture(TaskFuture, Protocol):
     """The future of a call that may be cancelled until it is given to a worker."""
 
     def claim(self) -> bool:
@@ -267,7 +267,7 @@ class Call:
         data: bytes,
         buffers: Sequence[memoryview],
         grants: GrantSet | None,
-        future: Future,
+        future: TaskFuture,
         blocking: bool = False,
     ) -> None:
         self.grants = grants
@@ -315,7 +315,7 @@ class WorkItem:
         kind: int,
         *,
         function: Function | None = None,
-        future: Future | None = None,
+        future: TaskFuture | None = None,
         unit: int = 1,
         exact: bool = False,
         timeout: float | None = None,
@@ -347,11 +347,11 @@ class WorkItem:
 
 
 def pickle_call(
-    future: Future,
+    future: TaskFuture,
     function: Callable[..., Any],
     args: Iterable[Any],
     kwargs: Mapping[str, Any],
-    reject: Callable[[Future, BaseException], None],
+    reject: Callable[[TaskFuture, BaseException], None],
     *,
     blocking: bool = False,
 ) -> Call | None:

@@ -89,7 +89,7 @@ class WorkerHandle:
         self.child: ChildHandle | None = None
         self.worker: WorkerEntry | None = None
         """Entry of the worker in the ledger, once it is ready."""
-        self.complaint = ""
+        self.init_error = ""
         """Error of its initializer, or of its start."""
         self.fault = ""
         """Wrong answer for which the pool has killed the worker."""
@@ -133,11 +133,11 @@ class WorkerHandle:
         """Count tasks that the worker has done."""
         self.tasks += tasks
 
-    def complain(self, error: str) -> None:
+    def note_init_error(self, error: str) -> None:
         """Note the error of the worker's initializer, or of its start."""
-        self.complaint = error
+        self.init_error = error
 
-    def convict(self, reason: str) -> None:
+    def kill_for(self, reason: str) -> None:
         """Kill the worker, since it sent what no worker sends."""
         self.fault = reason
         self.kill()
@@ -188,9 +188,9 @@ class WorkerHandle:
 
     def start_failure(self, report: ExitReport) -> StartFailure:
         """Return the start failure that the worker's end is, if the worker was not ready."""
-        text = self.complaint or "\n".join(report.log)
-        reason = "it raised an error" if self.complaint else report.reason
-        killed = report.cause == Cause.REFUSED or (not self.complaint and report.exitcode < 0)
+        text = self.init_error or "\n".join(report.log)
+        reason = "it raised an error" if self.init_error else report.reason
+        killed = report.cause == Cause.REFUSED or (not self.init_error and report.exitcode < 0)
         final = self.child.start_error if self.child and report.cause == Cause.NO_HOST else None
         return StartFailure(
             f"pool worker {self.name!r}",
