@@ -1,1 +1,1 @@
-"""Semaphores in shared memory whose tokens outlive nobody who held them."""
+"""Semaphores in shared memory: the tokens of a process that dies come back."""

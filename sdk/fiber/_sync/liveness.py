@@ -24,7 +24,7 @@ _START = (1 << 32) - 1
 
 
 def own_identity() -> int:
-    """The word for this process."""
+    """Return the identity of this process."""
     global _me
     if _me is None:
         _me = _own()
@@ -39,12 +39,12 @@ def _own() -> int:
 
 
 def pid_of(who: int) -> int:
-    """The pid in a word."""
+    """Return the pid in an identity."""
     return who & _PID
 
 
 def is_alive(who: int) -> bool:
-    """Tell whether that process still runs.  One that has ended and was not reaped does not."""
+    """Tell whether a process still runs.  A zombie does not."""
     return _start_time(who & _PID) == who >> 31
 
 
@@ -60,7 +60,7 @@ os.register_at_fork(after_in_child=_after_fork)
 def _start_time(pid: int) -> int | None:
     try:
         with open(f"/proc/{pid}/stat", "rb") as file:
-            # The name before it may have any character in it, the last parenthesis is its end.
+            # The process's name may have any character in it; it ends at the last parenthesis.
             fields = file.read().rpartition(b")")[2].split()
     except (FileNotFoundError, ProcessLookupError):
         return None
@@ -68,7 +68,7 @@ def _start_time(pid: int) -> int | None:
 
 
 MUTEX_SIZE = 64
-"""Bytes that it takes; some are spare."""
+"""Bytes reserved for a mutex.  It needs fewer."""
 
 _RECURSIVE, _ROBUST, _SHARED = 1, 1, 1
 _NAP = 0.0005  # seconds between two tries
@@ -80,7 +80,7 @@ _Result = TypeVar("_Result")
 
 
 class RobustMutex:
-    """Robust mutex at an address; ``create`` makes it, once, for all processes."""
+    """Robust mutex at an address.  One process calls ``create``, once, for all."""
 
     __slots__ = ("_address",)
 
@@ -88,20 +88,20 @@ class RobustMutex:
         self._address = ctypes.c_void_p(address)
 
     def create(self) -> None:
-        """Make it.  Recursive: a finalizer may come in the middle of what it guards."""
+        """Initialize the mutex.  It is recursive, as a finalizer may run while it is held."""
         _check(_libc.pthread_mutex_init(self._address, _attributes()))
 
     def run(self, action: Callable[[], _Result]) -> _Result:
-        """Call ``action`` under the mutex; return its result."""
+        """Call ``action`` while this process holds the mutex; return its result."""
         outcomes: list[int] = []
         try:
-            # The outcome is noted in the step that brings it: no signal strikes in between.
+            # One step locks and notes the outcome: no signal's handler runs in between.
             outcomes.extend(map(_libc.pthread_mutex_trylock, (self._address,)))
             while outcomes[-1] == errno.EBUSY:
                 time.sleep(_NAP)
                 outcomes.extend(map(_libc.pthread_mutex_trylock, (self._address,)))
             if outcomes[-1] == errno.EOWNERDEAD:
-                # Whatever it guards is changed in steps of which each leaves it in order.
+                # Each step of a change leaves the guarded data consistent.
                 _check(_libc.pthread_mutex_consistent(self._address))
             elif outcomes[-1]:
                 _check(outcomes[-1])

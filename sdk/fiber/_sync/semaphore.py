@@ -1,41 +1,42 @@
 """Semaphores in shared memory: the tokens of a process that dies come back.
 
-A token is a POSIX semaphore's, so to take one and to give it back is one step in C that the kernel
-can wait for.  What that does not say is who has it.  Beside it are *slots*, which belong to
-processes, one for each token that they have or are about to take::
+A token is one unit of a POSIX semaphore.  To take or to return it is one step in C, for which the
+kernel can wait.  The POSIX semaphore does not record which process holds a token.  So the memory
+also has *slots*.  A process has a slot for each token that it holds or is about to take::
 
     semaphore │ mutex │ attention, … │ slot │ slot │ …          slot: state, process, its name
 
-Only the thread that has taken a slot out of its process's lists writes its state::
+Only the thread that has removed a slot from its process's lists writes the slot's state::
 
     acquire                               release
       state = BUSY                          state = BUSY
-      stop?  then not                       stop?  then not
-      take a token                          give the token back
+      stop set?  then wait                  stop set?  then wait
+      take a token                          return the token
       state = HELD                          state = IDLE
 
-To revive is to give back the tokens of which no living process has a note.  One process at a time
-does it, which a robust mutex sees to:
+A *revival* returns the tokens that no living process has noted.  One process at a time does it,
+under a robust mutex:
 
-1. ``stop`` is set.  After a moment, longer than any processor keeps a store for itself, whoever
-   reads it sees it, and whoever read it before is seen to be busy.
-2. It waits until no living process is busy: all those have noted what they have, and none takes or
-   gives anything now.  (One that does not get on, since it is stopped, puts the revival off: it may
-   have the token.)
-3. Tokens that are neither there nor noted by the living are lost.  They are given back.
-4. The slots of the dead are free, and ``stop`` is cleared.
+1. It sets ``stop``.  After a moment, longer than any processor delays a store, each reader of
+   ``stop`` sees it, and each process that read it before is seen to be busy.
+2. It waits until no living process is busy.  Then all living processes have noted their tokens, and
+   none takes or returns a token.  (A process that is stopped in the middle postpones the revival,
+   as it may hold the token.)
+3. Tokens that are neither available nor noted by a living process are lost.  The revival returns
+   them.
+4. It frees the slots of dead processes and clears ``stop``.
 
-So nobody has a token that another one has: only lost ones are made anew, and what makes them lost,
-that who had them is dead and all others have noted what they have, stays so.  A reviver that dies
-leaves ``stop`` and the mutex to the next one, who finds the same or less that is lost.
+So no token exists twice.  Only lost tokens are made again, and a lost token stays lost: its holder
+is dead, and all living processes have noted their tokens.  If the process dies during a revival, it
+leaves ``stop`` and the mutex to the next one, which finds the same tokens lost, or fewer.
 
-Who is interrupted between two steps cannot tell how far it came, and leaves the slot as if it had
-died: state = LEFT.
+A thread that is interrupted between two steps cannot know how far it got.  It leaves the slot as if
+its process had died: state = LEFT.
 
-A process that gives back what it has not acquired gives another one's token, or makes one of
-nothing: who has which cannot be told any more.  From there on nothing is revived.
+A process that returns a token that it has not acquired returns the token of another process, or
+adds one.  From then on the holders are unknown, and tokens are not revived.
 
-No Python lock is taken: a finalizer, a signal's handler or a thread may come at any line.
+No Python lock is taken: a finalizer, a signal's handler or a thread may run between any two steps.
 """
 
 from __future__ import annotations
@@ -58,35 +59,36 @@ RECURSIVE, COUNTING = 0, 1  # SemLock's kinds, in its own numbers
 SEM_VALUE_MAX: int = SemLock.SEM_VALUE_MAX
 
 SEMAPHORE_SIZE = 1 << 15
-"""Bytes of a semaphore.  The kernel gives memory for the pages that are used."""
+"""Bytes of a semaphore.  The kernel provides memory only for pages that are used."""
 
 SLICE = 0.2
-"""Seconds that one wait in the kernel lasts: so long a signal may be slept over, and a token of a
-dead process lie unnoticed.
+"""Seconds that one wait in the kernel lasts.
+
+For so long a signal may wait for its handler, and a token of a dead process may go unnoticed.
 """
 
-_MOMENT = 0.002  # seconds until what is stored here is seen by all
-_QUIET = 1.0  # seconds that a revival waits for those who are busy, before it is put off
+_MOMENT = 0.002  # seconds until all processors see a store
+_QUIET = 1.0  # seconds that a revival waits for busy processes before it is postponed
 _NAP = 0.001
 
-# Words of 8 bytes, which are read and written in one piece.  The first four are the semaphore.
+# Words of 8 bytes, each read and written in one step.  The first four are the POSIX semaphore.
 _MUTEX = 8
 _ATTENTION = 16
 _IS_UNTRACKED = 17
 _TOTAL = 18
 _MAXIMUM = 19
-_DEAD = range(20, 31)  # whose token was given back, in words
+_DEAD = range(20, 31)  # name of the process whose token was returned last
 _SLOTS = range(32, SEMAPHORE_SIZE // 8, 8)
 _NO_SLOT = 31
-"""Mark in place of a slot, when there are no more."""
+"""Number in place of a slot when no slot is left."""
 
-# Of a slot
-_WHO = 1  # the process, or 0: it is nobody's
+# Words of a slot, after its state
+_WHO = 1  # identity of the process; 0 if the slot is free
 _NAME = 2
 _NAME_BYTES = 48
 _IDLE, _BUSY, _HELD, _LEFT = range(4)  # states
 
-# Bytes of the word ``attention``.  Who reads it reads them all at once.
+# Bytes of the word ``attention``, which is read as a whole.
 _STOP = 8 * _ATTENTION
 _ABANDONED = 8 * _ATTENTION + 1
 _LISTENS = 8 * _ATTENTION + 2
@@ -100,21 +102,22 @@ _libc = ctypes.PyDLL(None, use_errno=True)
 
 
 if TYPE_CHECKING:
-    # No class can inherit from bool, and `acquire` returns a bool to those who do not care.
+    # No class can inherit from bool, and for most callers `acquire` returns a bool.
     _Bool = bool
 else:
     _Bool = int
 
 
 class Abandoned(_Bool):  # type: ignore[misc]  # bool is final
-    """The result of an ``acquire`` that got what another process held when it ended.
+    """Result of an ``acquire`` that got a lock which another process held when it ended.
 
-    It is true and equal to True, so nobody has to know of it.  What the lock guards may be half
-    changed: who cares tells it by ``isinstance(lock.acquire(), Abandoned)``.
+    It is true and equal to True, so most callers can ignore it.  The data that the lock guards may
+    be half changed.  A caller that has to know checks
+    ``isinstance(lock.acquire(), Abandoned)``.
     """
 
     holder: str
-    """The process that ended."""
+    """Name of the process that ended."""
 
     def __new__(cls, holder: str) -> Self:
         self: Any = super().__new__(cls, 1)
@@ -129,19 +132,19 @@ class Abandoned(_Bool):  # type: ignore[misc]  # bool is final
 
 
 class SharedBlock(Protocol):
-    """Memory that processes of this host share."""
+    """Block of memory that processes of this host share."""
 
     @property
     def view(self) -> memoryview:
-        """All of it, to be written to."""
+        """Writable view of the whole block."""
 
     @property
     def address(self) -> int:
-        """Address of the semaphore in this process."""
+        """Address of the block in this process."""
 
 
 class SharedSemaphore:
-    """A semaphore, as this process sees it; with the methods of multiprocessing's ``SemLock``."""
+    """Semaphore in shared memory, with the methods of multiprocessing's ``SemLock``."""
 
     __slots__ = (
         "__weakref__", "_bytes", "_candidates", "_count", "_get_value", "_give", "_held", "_idle",
@@ -177,9 +180,9 @@ class SharedSemaphore:
     def create(
         cls, block: SharedBlock, kind: int, value: int, maximum: int, ring: Callable[[], None]
     ) -> SharedSemaphore:
-        """Begin the life of one in zeroed memory.
+        """Make a semaphore in zeroed memory.
 
-        ``ring`` is called when a token is given back while the hub listens.
+        ``ring`` is called when a token is returned while the hub listens.
         """
         make_semaphore(block.address, value)
         words = block.view.cast("q")
@@ -189,7 +192,7 @@ class SharedSemaphore:
         return new
 
     def _begin(self) -> None:
-        """Begin in a new process, which may be a fork and does not have its parent's tokens."""
+        """Begin without tokens, in a new process or in a fork."""
         self._me = liveness.own_identity()
         self._idle: list[int] = []
         self._held: list[int] = []
@@ -200,11 +203,11 @@ class SharedSemaphore:
         self._begin()
 
     def acquire(self, block: bool = True, timeout: float | None = None) -> bool | Abandoned:
-        """Take a token; False if there is none, nor within ``timeout`` seconds."""
+        """Take a token; False if there is none within ``timeout`` seconds."""
         if self._is_recursive and self._is_mine():
             return self._acquire_again()
         if self._is_mutex:
-            # ``_try_acquire``, in the fewest steps.
+            # The same as ``_try_acquire``, in fewer steps.
             words = self._words
             try:
                 slot = self._idle.pop()
@@ -213,7 +216,7 @@ class SharedSemaphore:
             try:
                 words[slot] = _BUSY
                 if not words[_ATTENTION] & _IS_SPECIAL and self._take(False):
-                    # CPython looks for signals after a call, and there is none from here on.
+                    # CPython runs signal handlers after a call, and no call follows from here on.
                     words[slot] = _HELD
                     self._held += (slot,)
                     return True
@@ -225,10 +228,10 @@ class SharedSemaphore:
         return self._acquire(block, timeout)
 
     def release(self, *, wait: bool = True) -> bool:
-        """Give a token back; ValueError if there are as many as there can be.
+        """Return a token; ValueError if the semaphore is at its maximum.
 
-        AssertionError if it is recursive and this thread has not acquired it.  Unless it is to
-        ``wait`` it is False, and nothing is done, while dead processes' tokens are given back.
+        AssertionError if it is recursive and this thread has not acquired it.  Without ``wait``,
+        the result is False during a revival, and the token is not returned.
         """
         if self._is_recursive and (not self._is_mine() or self._count() > 1):
             self._give()
@@ -261,20 +264,20 @@ class SharedSemaphore:
         return True
 
     def is_untracked(self) -> bool:
-        """True if the tokens of dead processes are not given back."""
+        """Tell whether the holders are unknown, so that tokens of dead processes stay lost."""
         return bool(self._words[_IS_UNTRACKED])
 
     def listen(self, listens: bool) -> None:
-        """Set whether a release rings the hub."""
+        """Set whether a release rings the hub's doorbell."""
         self._bytes[_LISTENS] = listens
 
     def try_acquire(self) -> bool | Abandoned:
-        """Take a token if there is one, and look for none that are lost: it takes no time."""
+        """Take a token if there is one.  Never wait, and look for no lost tokens."""
         taken: list[int] = []
         return self._try_acquire(_NO_WAIT, taken) and self._acquired_result()
 
     def abandon(self, holder: str) -> None:
-        """Have the next one to acquire it know who had it."""
+        """Note for the next acquirer that the process ``holder`` ended with a token."""
         start, size = 8 * _DEAD.start, 8 * len(_DEAD)
         self._bytes[start : start + size] = holder.encode()[:size].ljust(size, b"\0")
         self._bytes[_ABANDONED] = 1
@@ -312,7 +315,7 @@ class SharedSemaphore:
         try:
             words[slot] = _BUSY
             if not words[_ATTENTION] & _IS_STOPPED:
-                # In the step that takes it: no signal strikes in between.
+                # One step takes it and notes it: no signal's handler runs in between.
                 taken.extend(compress((slot,), starmap(self._take, (wait,))))
         except BaseException:
             if taken:
@@ -326,27 +329,27 @@ class SharedSemaphore:
             self._idle += (slot,)
             return False
         words[slot] = _HELD
-        if slot == _NO_SLOT:  # nobody notes what signals there were
+        if slot == _NO_SLOT:  # no slot: the token has no note
             self._idle += (slot,)
         else:
             self._held += (slot,)
         return True
 
     def _give_untracked(self) -> None:
-        """Give back what this process has not acquired.  With the mutex."""
+        """Return a token that this process has not acquired.  The caller holds the mutex."""
         self._give()
         self._words[_IS_UNTRACKED] = True
         if self._words[_ATTENTION] & _IS_LISTENED_TO:
             self._ring()
 
     def _leave(self, slot: int) -> None:
-        """Leave a slot after an interrupt.  A revival will see whether a token is lost."""
+        """Leave a slot after an interrupt.  A revival finds out whether a token is lost."""
         if self._is_recursive and self._is_mine():
-            self._sem._after_fork()  # it is not: the count is zero
+            self._sem._after_fork()  # sets the count to zero: this thread no longer holds it
         self._words[slot] = _LEFT
 
     def _acquired_result(self) -> bool | Abandoned:
-        """Return the result for an acquirer: the first one after a death is told of it."""
+        """Return True, or ``Abandoned`` for the first acquirer after a holder's death."""
         if not self._bytes[_ABANDONED]:
             return True
         self._bytes[_ABANDONED] = 0
@@ -372,11 +375,11 @@ class SharedSemaphore:
         return bool(self._words[_ATTENTION] & _IS_STOPPED)
 
     def _park(self) -> None:
-        """Wait until a revival is over, and go on with it if its process died."""
+        """Wait until a revival is over.  If its process died, finish it."""
         self._warn(self._mutex.run(lambda: self._revive() if self._is_stopped() else []))
 
     def _look_after_the_dead(self) -> bool:
-        """Now and then: whether tokens were lost, which are given back."""
+        """Revive lost tokens, if the last look is long enough ago; return whether that was done."""
         now = time.monotonic()
         if now < self._next_look:
             return False
@@ -389,22 +392,25 @@ class SharedSemaphore:
     # Reviving
 
     def revive(self) -> None:
-        """Give back the tokens of those who are gone, and say whose they were."""
+        """Return the tokens of dead processes, and warn with their names."""
         self._warn(self._mutex.run(self._revive))
 
     def is_suspicious(self) -> bool:
-        """Tell whether a dead process has a token, or may have one."""
+        """Tell whether a dead process has a token or may have one."""
         words = self._words
         if words[_IS_UNTRACKED] or self._get_value():
             return False
         states = [(words[slot], slot) for slot in self._used()]
         noted = sum(state == _HELD for state, _ in states)
-        # If all are noted, nobody who is only busy has one: most of those wait for it.
+        # If all tokens are noted, a busy process has none: it waits for one.
         least = _HELD if noted == words[_TOTAL] else _BUSY
         return any(self._is_gone(slot) for state, slot in states if state >= least)
 
     def _revive(self) -> list[str]:
-        """Give back the tokens of those who are gone; the names of the dead.  With the mutex."""
+        """Return the tokens of dead processes; the result is their names.
+
+        The caller holds the mutex.
+        """
         self._revivals += 1
         revival = self._revivals
         words = self._words
@@ -420,11 +426,11 @@ class SharedSemaphore:
                 released = self._names(gone)
                 if released:
                     self.abandon(released[-1])
-                # By another view of it: ours counts what this process has.
+                # By another SemLock: the one of this object counts the tokens of this process.
                 give = self._semlock(COUNTING).release
                 for _ in range(lost):
                     if self._revivals != revival:
-                        break  # a signal's handler has done it all, in the middle of this
+                        break  # a signal's handler ran a whole revival in between
                     give()
             for slot, who in gone.items():
                 if words[slot + _WHO] == who:
@@ -434,9 +440,9 @@ class SharedSemaphore:
         return released
 
     def _wait_until_quiet(self) -> dict[int, int]:
-        """Wait until nobody who is there is busy: the slots of all who are not.
+        """Wait until no living process is busy; return the slots of dead processes.
 
-        None of them if that takes too long.
+        Return no slots if that takes too long.
         """
         words = self._words
         deadline = time.monotonic() + _QUIET
@@ -450,7 +456,7 @@ class SharedSemaphore:
             time.sleep(_NAP)
 
     def _names(self, gone: Iterable[int]) -> list[str]:
-        """The dead who had a token; if none has a note of one, who may have had it."""
+        """Return the dead processes that held a token, or else those that may have held one."""
         states = {slot: self._words[slot] for slot in gone}
         for state in (_HELD, _BUSY):
             if state in states.values():
@@ -459,12 +465,12 @@ class SharedSemaphore:
 
     def _warn(self, released: list[str]) -> None:
         for process in dict.fromkeys(released):
-            warn_of(process, stacklevel=8)  # who called acquire()
+            warn_of(process, stacklevel=8)  # the caller of acquire()
 
     # Slots
 
     def _used(self) -> Iterator[int]:
-        """All slots that belong to somebody."""
+        """Return the slots that are not free."""
         return compress(_SLOTS, self._words[_SLOTS.start + _WHO :: _SLOTS.step].tolist())
 
     def _is_gone(self, slot: int) -> bool:
@@ -477,15 +483,15 @@ class SharedSemaphore:
         return f"{name} (pid {liveness.pid_of(self._words[slot + _WHO])})"
 
     def _claim(self) -> int:
-        """Claim another slot for this process.  Called with the mutex."""
+        """Take a free slot for this process.  The caller holds the mutex."""
         for _ in range(0 if self._words[_IS_UNTRACKED] else 2):
-            # One iterator for all: whoever interrupts this search looks at other slots.
+            # One iterator for all threads: a handler that interrupts this search gets other slots.
             for slot in self._candidates:
                 if not self._words[slot + _WHO]:
                     return self._settle(slot)
             self._revive()
             self._candidates = iter(_SLOTS)
-        # More tokens are taken, or waited for, than can be told apart.
+        # More tokens are taken, or waited for, than there are slots.
         self._words[_IS_UNTRACKED] = True
         return _NO_SLOT
 
@@ -494,7 +500,7 @@ class SharedSemaphore:
         words[slot] = _IDLE
         name = current_process().name.encode()[:_NAME_BYTES]
         self._bytes[start : start + _NAME_BYTES] = name.ljust(_NAME_BYTES, b"\0")
-        words[slot + _WHO] = self._me  # last: from here on it is ours
+        words[slot + _WHO] = self._me  # last: from here on the slot is taken
         return slot
 
     def _semlock(self, kind: int) -> SemLock:
@@ -502,21 +508,21 @@ class SharedSemaphore:
 
 
 def make_semaphore(address: int, value: int) -> None:
-    """Begin the life of a POSIX semaphore that processes share."""
+    """Initialize a POSIX semaphore that processes share."""
     if _libc.sem_init(ctypes.c_void_p(address), 1, value):
         code = ctypes.get_errno()
         raise OSError(code, os.strerror(code))
 
 
 def semaphore_at(address: int, kind: int = COUNTING, maximum: int = SEM_VALUE_MAX) -> SemLock:
-    """A view of one."""
-    # Without a name it takes the handle, an address here, as it is.  What it does at its end,
-    # ``sem_close``, is refused for an address that ``sem_open`` never gave.
+    """Return a SemLock for the POSIX semaphore at an address."""
+    # Without a name SemLock uses the handle, here an address, unchanged.  At its end it calls
+    # ``sem_close``, which refuses an address that did not come from ``sem_open``.
     return SemLock._rebuild(address, kind, maximum, None)
 
 
 def warn_of(holder: str, *, stacklevel: int = 2) -> None:
-    """Say that it died with a token."""
+    """Warn that the process ``holder`` ended with a token."""
     warnings.warn(
         f"{holder} ended while it held a lock or semaphore, which is released: what it guards may "
         "be half changed",

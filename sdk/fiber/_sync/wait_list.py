@@ -1,13 +1,13 @@
-"""Wait list of a condition: a table in shared memory.  Only the holder of the condition's lock
-changes it.
+"""Wait list of a condition: a table in shared memory.
 
-::
+Only the holder of the condition's lock changes it::
 
-    next ticket │ two words of the user's │ end │ place │ place │ …
+    next ticket │ two words for the user │ end │ place │ place │ …
 
-A *place* is for one thread that waits: what became of it, whose it is, when it came, and a
-semaphore on which it sleeps.  Each change is one store, so a holder that dies between two leaves
-the table in order.  To leave a place is one store, too, for which nobody needs the lock.
+A *place* is for one waiting thread.  It has its state, the identity of its process, its ticket, and
+a semaphore on which the thread sleeps.  Each change is one store, so a lock holder that dies
+between two changes leaves the table consistent.  To leave a place is one store too, without the
+lock.
 """
 
 from __future__ import annotations
@@ -25,26 +25,26 @@ WAIT_LIST_SIZE = 1 << 15
 # Words of 8 bytes
 _TICKET = 0
 _USERS = 1
-_END = 3  # of the places that anybody ever had
+_END = 3  # of the places that were ever taken
 _PLACES = range(8, WAIT_LIST_SIZE // 8, 8)
-# Of a place
+# Words of a place
 _STATE = 0
-_WHO = 1  # the process, or 0: it is free
+_WHO = 1  # identity of the process; 0 if the place is free
 _CAME = 2
-_HELD = 3  # what ``hold`` was told
+_HELD = 3  # number of things, set by ``hold``
 _BELL = 4
 _WAITS, _WAITS_AFAR, _LOST, _NOTIFIED = range(4)
 
 
 class Raisable(Protocol):
-    """A count of free things."""
+    """Counter that ``reclaim`` can raise."""
 
     def add(self, n: int) -> None:
         """Raise the count."""
 
 
 class WaitList:
-    """Wait list on the side of this process."""
+    """Wait list, as this process uses it."""
 
     __slots__ = ("__weakref__", "_ring", "_words", "block")
 
@@ -54,7 +54,7 @@ class WaitList:
         self._words = block.view.cast("q")
 
     def enter(self, *, afar: bool = False) -> int:
-        """A place for this thread.  ``afar``: the hub's, for one of another host."""
+        """Take a place for this thread; ``afar``: for a process of another host."""
         words = self._words
         place = self._free_place()
         words[_END] = max(words[_END], place + _PLACES.step)
@@ -66,7 +66,7 @@ class WaitList:
         return place
 
     def sleep(self, place: int, timeout: float | None) -> None:
-        """Wait until that place is notified, for ``timeout`` seconds at most.  Without the lock."""
+        """Wait without the lock until ``place`` is notified, at most ``timeout`` seconds."""
         bell = semaphore_at(self._bell(place))
         deadline = None if timeout is None else time.monotonic() + timeout
         while not self.is_notified(place):
@@ -85,7 +85,7 @@ class WaitList:
         return notified
 
     def dismiss(self, place: int) -> None:
-        """Free a place that was taken for longer."""
+        """Free a place that was kept over several waits."""
         self._words[place + _WHO] = 0
 
     def lose(self, place: int) -> None:
@@ -93,7 +93,7 @@ class WaitList:
         self._words[place] = _LOST
 
     def notify(self, n: int) -> None:
-        """Wake the ``n`` that have waited for longest; who died meanwhile is passed over."""
+        """Wake the ``n`` threads that have waited longest.  Skip dead ones."""
         words = self._words
         waiting = [place for place in self._used() if words[place] in (_WAITS, _WAITS_AFAR)]
         if n < len(waiting):
@@ -111,32 +111,32 @@ class WaitList:
         return sum(self._words[place] in (_WAITS, _WAITS_AFAR) for place in self._used())
 
     def bury(self) -> int:
-        """Return how many waiters died since the last call."""
+        """Free the places of dead waiters; return their number."""
         dead = [place for place in self._used() if self._is_dead(place)]
         for place in dead:
             self._words[place + _WHO] = 0
         return len(dead)
 
     def hold(self, place: int, number: int) -> None:
-        """Note how many things the owner of a place has.  Without the lock."""
+        """Note how many things the process at ``place`` has.  Needs no lock."""
         self._words[place + _HELD] = number
 
     def tally(self, place: int, held: int, total: int) -> None:
-        """Note how many things the owner of a place has, and set the user's second word."""
+        """Note how many things the process at ``place`` has, and set the user's second word."""
         self._words[place + _HELD] = held
         self.set(1, total)
 
     def held(self) -> int:
-        """Return the number of things that all owners of places have."""
+        """Return the number of things that the processes of all places have."""
         return sum(self._words[place + _HELD] for place in self._used())
 
     def reclaim(self, counter: Raisable) -> int:
-        """Free the places of dead processes; give ``counter`` what they had and return it."""
+        """Free the places of dead processes, add their things to ``counter``, and count these."""
         dead = [place for place in self._used() if self._is_dead(place)]
         total = 0
         for place in dead:
             if held := self._words[place + _HELD]:
-                counter.add(held)  # first: after a death here it is given back twice, not never
+                counter.add(held)  # first: after a death here they are added twice, not never
                 total += held
             self._words[place + _WHO] = 0
         return total
@@ -146,7 +146,7 @@ class WaitList:
         return self._words[_USERS + number]
 
     def set(self, number: int, value: int) -> None:
-        """Set it."""
+        """Set one of the user's two words."""
         self._words[_USERS + number] = value
 
     def _free_place(self) -> int:

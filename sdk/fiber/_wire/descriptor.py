@@ -1,4 +1,4 @@
-"""Owners of descriptors.  A descriptor is closed with its last owner, also if a signal strikes."""
+"""Owners of descriptors.  A descriptor is closed with its last owner, also after a signal."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from socket import SocketType
 from typing import Any, TypeAlias
 
 Descriptor: TypeAlias = select.epoll
-"""The owner of a descriptor: ``fileno``, ``close``; closed at the latest with its last reference.
+"""Owner of a descriptor, with ``fileno`` and ``close``.
 
-Of what the standard library has, ``select.epoll.fromfd`` alone takes over a descriptor of any kind
-and closes it in C and without a warning.  A class with ``__del__`` would not do: a handler that
-raises there leaves the descriptor open for ever.
+The descriptor is closed with the last reference at the latest.  In the standard library, only
+``select.epoll.fromfd`` takes over a descriptor of any kind and closes it in C, without a warning.
+A class with ``__del__`` is not enough: a signal's handler that raises there leaves the descriptor
+open for ever.
 """
 
 
@@ -26,8 +27,8 @@ own: Callable[[int], Descriptor] = select.epoll.fromfd
 def opened(opener: Callable[..., int], *args: Any) -> Descriptor:
     """Call ``opener(*args)``, a function written in C; return the owner of what it opens.
 
-    The call is one step of the interpreter, and signals strike between steps.  So there is no
-    moment at which the descriptor has no owner.
+    The call is one step of the interpreter, and a signal's handler runs between steps.  So the
+    descriptor has an owner at each moment.
     """
     return next(map(own, starmap(opener, (args,))))
 

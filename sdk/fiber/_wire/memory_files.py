@@ -36,21 +36,21 @@ BytesLike: TypeAlias = bytes | bytearray | memoryview
 RETAINED_LIMIT = 1 << 25
 """Bytes of memory kept for later messages, per process.
 
- Larger messages get memory of their own.
+A larger message gets new memory.
 """
 
 RETAINED_BLOCKS = 32
-"""Number of blocks that this memory is kept in.  Each holds two descriptors."""
+"""Number of blocks that are kept.  Each holds two descriptors."""
 
 HUGE_PAGES_UP_TO = 1 << 30
-"""Bytes of a message for which huge pages are asked for.
+"""Bytes of a message up to which huge pages are requested.
 
-They save a page fault for each 4 KiB, which costs several times the copy.  For more, a virtual
-machine has to get memory back from its host first: that was slower than small pages.
+Huge pages save a page fault for each 4 KiB, which costs several times the copy.  For a larger
+message a virtual machine first has to get memory from its host, which is slower than small pages.
 """
 
 DATA_OFFSET = 64
-"""Bytes before the content in a block.  The flag lies there."""
+"""Bytes before the content of a block.  The first is the flag."""
 
 _BUSY, _FREE = 1, 0
 _CLEARED = bytes([_FREE])
@@ -58,7 +58,7 @@ _GRAIN = 1 << 16
 
 
 class MessageBlock:
-    """Memfd, and its mapped page that holds the flag."""
+    """Memfd for one message, with its first page mapped for the flag."""
 
     __slots__ = ("_owner", "capacity", "fd", "flag")
 
@@ -67,14 +67,14 @@ class MessageBlock:
         flags = os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING
         self._owner = opened(os.memfd_create, "fiber-message", flags)
         self.fd = self._owner.fileno()
-        # Readers that map the content rely on its size.
+        # A reader that maps the content relies on the file's size.
         fcntl.fcntl(self.fd, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK)
         os.ftruncate(self.fd, mmap.PAGESIZE)
         self.flag = mmap.mmap(self.fd, mmap.PAGESIZE)
         self.flag[0] = _BUSY
 
     def close(self) -> None:
-        """Close the block.  A reader that has the descriptor keeps the content."""
+        """Close the block.  A reader that has a descriptor keeps the content."""
         self.flag.close()
         self._owner.close()
 
@@ -82,7 +82,7 @@ class MessageBlock:
 class Arena:
     """Blocks of this process.  Any thread may use them; a forked child starts with none.
 
-    There is no lock, as a finalizer that sends a large message could wait for it on its own thread.
+    There is no lock: a finalizer that sends a large message could wait for it on the same thread.
     A thread takes a block out, and owns it until it puts it back.
     """
 
@@ -91,13 +91,13 @@ class Arena:
         os.register_at_fork(after_in_child=self._forget)
 
     def _forget(self) -> None:
-        # Parent and child would both believe that a free block is theirs alone.
+        # Parent and child would otherwise both reuse the same free block.
         blocks, self._blocks = self._blocks, deque()
         for block in blocks:
             block.close()
 
     def claim(self, size: int) -> MessageBlock:
-        """A block with room for ``size`` bytes, marked busy.  Give it back with ``settle``."""
+        """Return a busy block with room for ``size`` bytes.  Give it back with ``settle``."""
         capacity = -(-size // _GRAIN) * _GRAIN
         for _ in range(len(self._blocks)):
             try:
@@ -111,7 +111,7 @@ class Arena:
         return MessageBlock(capacity)
 
     def settle(self, block: MessageBlock, *, sent: bool) -> None:
-        """The message went out (``sent``) or did not; keep the block or let it go."""
+        """Put a block back after its message was ``sent`` or not; close it if it is not kept."""
         if not sent:
             block.flag[0] = _FREE
         if block.capacity > RETAINED_LIMIT:
@@ -119,11 +119,11 @@ class Arena:
             return
         self._blocks.append(block)
         while self._too_much():
-            with contextlib.suppress(IndexError):  # others have taken them all
+            with contextlib.suppress(IndexError):  # other threads have taken them all
                 self._blocks.popleft().close()
 
     def _too_much(self) -> bool:
-        blocks = tuple(self._blocks)  # in one piece, whoever changes it meanwhile
+        blocks = tuple(self._blocks)  # one step, as other threads change the deque
         if len(blocks) > RETAINED_BLOCKS:
             return True
         return sum(block.capacity for block in blocks) > RETAINED_LIMIT
@@ -144,7 +144,7 @@ def release(fd: int) -> None:
 
 
 SLOWLY = 1 << 27
-"""Bytes of memory from which on a thread gives it back: for a gigabyte that takes 0.2 s."""
+"""Bytes from which a thread gives memory back to the system: a gigabyte takes 0.2 s."""
 
 _STEP = 1 << 24
 
@@ -157,9 +157,9 @@ class Mapping(mmap.mmap):
     """Id of the process that made it.  A fork of that process does not give it back."""
 
     def __del__(self) -> None:
-        # While the interpreter ends no thread begins any more, and its start would wait for that.
+        # At the interpreter's end a new thread does not run, and its start would wait for ever.
         if self.process == os.getpid() and len(self) >= SLOWLY and not sys.is_finalizing():
-            with contextlib.suppress(RuntimeError):  # then it takes what it takes
+            with contextlib.suppress(RuntimeError):  # no thread: it is given back here
                 threading.Thread(target=self._give_back, name="fiber-free", daemon=True).start()
 
     def _give_back(self) -> None:
@@ -168,15 +168,15 @@ class Mapping(mmap.mmap):
             self.madvise(mmap.MADV_DONTNEED, start, min(_STEP, len(self) - start))
         self.close()
         if self.owner is not None:
-            self.owner.close()  # the last of it: the system frees the content, and we do not wait
+            self.owner.close()  # now the system frees the content, on this thread
 
 
 def mapping(memory: Descriptor, size: int) -> Mapping:
-    """Map a message; MemoryError or TooManyOpenFiles says that this process has no room for it."""
+    """Map a message; MemoryError or TooManyOpenFiles if this process has no room for it."""
     try:
         mapped = Mapping(memory.fileno(), size)
     except OSError as error:
-        if error.errno in (errno.EMFILE, errno.ENFILE):  # a mapping has a descriptor of its own
+        if error.errno in (errno.EMFILE, errno.ENFILE):  # a mapping duplicates the descriptor
             raise TooManyOpenFiles("receiving a large message") from error
         if error.errno == errno.ENOMEM:
             raise MemoryError(f"no memory is left to receive a message of {size} bytes") from error
@@ -186,7 +186,7 @@ def mapping(memory: Descriptor, size: int) -> Mapping:
 
 
 class _BorrowedBlock(Mapping):
-    """A sender's block as its reader has it: its sender's again once no view of it is left."""
+    """Sender's block that a reader uses in place.  It is free again when its last view is gone."""
 
     def __del__(self) -> None:
         if self.process == os.getpid():
@@ -196,26 +196,26 @@ class _BorrowedBlock(Mapping):
 
 
 BORROWED_BLOCKS = 64
-"""Blocks of others that a process reads in place at a time; each holds two descriptors."""
+"""Limit of other processes' blocks that a process reads in place.  Each holds two descriptors."""
 
 _free_borrows = deque([None] * BORROWED_BLOCKS)
 
 
 def in_place(memory: Descriptor, size: int) -> memoryview | None:
-    """A sender's block, not copied; None if that has to be copied.
+    """Return a view of a sender's block, or None if the content has to be copied.
 
-    That is so where the sender could make it shorter, since to read beyond the end of a file is the
-    end of this process, and where BORROWED_BLOCKS are being read.
+    It has to be copied if the sender could make the file shorter, because a process that reads
+    beyond the end of a mapped file is killed, and if BORROWED_BLOCKS are in use.
     """
     try:
         if not fcntl.fcntl(memory.fileno(), fcntl.F_GET_SEALS) & fcntl.F_SEAL_SHRINK:
             return None
         _free_borrows.pop()
-    except (OSError, IndexError):  # no memfd at all, or enough of them
+    except (OSError, IndexError):  # no memfd, or too many borrowed blocks
         return None
     try:
         borrowed = _BorrowedBlock(memory.fileno(), size)
-    except OSError:  # no descriptor or mapping is left: to copy it takes none
+    except OSError:  # no descriptor or mapping is left; a copy needs none
         _free_borrows.append(None)
         return None
     except BaseException:
@@ -228,14 +228,14 @@ def in_place(memory: Descriptor, size: int) -> memoryview | None:
 IN_FILE = 1 << 22
 """Bytes from which a frame gets a memfd.
 
-A smaller one is copied once more on its way, into memory that is used again and again.
+A smaller frame is copied once more on its way, into memory that is reused.
 """
 
 
 class Assembly:
-    """A frame of ``size`` bytes of which the pieces arrive in order.
+    """Frame of ``size`` bytes whose pieces arrive in order.
 
-    One that this process does not pass on has memory that is private to it, and costs half.
+    A frame that is not ``passed_on`` to another process gets private memory, at half the cost.
     """
 
     __slots__ = ("_memory", "_small", "arrived", "size")
@@ -247,7 +247,7 @@ class Assembly:
         self._memory = _frame_memory(size, passed_on) if size >= IN_FILE else None
 
     def add(self, piece: memoryview) -> None:
-        """Copy the next piece; ValueError if it is more than was announced."""
+        """Copy the next piece; ValueError if the frame gets longer than announced."""
         begin = self.arrived
         self.arrived += len(piece)
         if self.arrived > self.size:
@@ -261,32 +261,33 @@ class Assembly:
             _write_at(self._memory.owner.fileno(), piece, DATA_OFFSET + begin)
 
     def frame(self) -> bytearray | memoryview:
-        """Return the frame; ValueError if some of it is missing."""
+        """Return the frame; ValueError if a piece is missing."""
         if self.arrived < self.size:
             raise ValueError(f"it ends after {self.arrived} of {self.size} bytes")
         return self._small if self._memory is None else memoryview(self._memory)[DATA_OFFSET:]
 
 
 class FrameMemory(Mapping):
-    """FrameMemory of one frame, laid out as an arena's block, which is not used again.
+    """Memory of one frame, with the layout of an arena's block.  It is not reused.
 
-    It has no ``owner`` where it is not passed on, or where the system had no descriptor for it or
-    lets this process write no files.
+    It has no ``owner`` if the frame is not passed on, if the system had no descriptor left, or if
+    this process may write no files.
     """
 
     passes_on = False
 
 
 def pass_on(view: memoryview) -> None:
-    """Let packets refer to the memory of ``view``, which must not change from now on."""
+    """Let packets refer to the memory of ``view``.  The memory must not change from now on."""
     memory = view.obj
     if isinstance(memory, FrameMemory):
         memory.passes_on = True
 
 
 def place_of(view: memoryview) -> tuple[Descriptor, int] | None:
-    """Return the descriptor that a packet may refer to instead of copying ``view``, and where in it
-    that lies.
+    """Return a descriptor and an offset that a packet may carry instead of a copy of ``view``.
+
+    None if ``view`` has to be copied.
     """
     memory = view.obj
     if (
@@ -300,7 +301,7 @@ def place_of(view: memoryview) -> tuple[Descriptor, int] | None:
 
 
 def _frame_memory(size: int, passed_on: bool) -> FrameMemory:
-    """OSError, ValueError or OverflowError if there is no room for so much."""
+    """Return memory for a frame; OSError, ValueError or OverflowError if there is no room."""
     total = DATA_OFFSET + size
     if not passed_on:
         return _private_memory(total)
@@ -308,7 +309,7 @@ def _frame_memory(size: int, passed_on: bool) -> FrameMemory:
         flags = os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING
         owner = opened(os.memfd_create, "fiber-frame", flags)
         os.ftruncate(owner.fileno(), total)
-        fcntl.fcntl(owner.fileno(), fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK)  # as of every block
+        fcntl.fcntl(owner.fileno(), fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK)  # as in a block
         memory = FrameMemory(owner.fileno(), total)
     except OSError:
         return _private_memory(total)
@@ -320,7 +321,7 @@ def _private_memory(total: int) -> FrameMemory:
     memory = FrameMemory(-1, total, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
     memory.process = os.getpid()
     if total <= HUGE_PAGES_UP_TO:
-        with contextlib.suppress(OSError):  # a kernel may have none
+        with contextlib.suppress(OSError):  # not every kernel has them
             memory.madvise(mmap.MADV_HUGEPAGE)
     return memory
 
@@ -332,15 +333,15 @@ def _write_at(fd: int, piece: memoryview, offset: int) -> None:
 
 
 class Blob:
-    """Bytes, named by their content.
+    """Bytes that many children need, named by the hash of their content.
 
-    An agent has them for as long as the master has the object (``fiber._backends.remote``).
+    An agent keeps them for as long as the master has the object (``fiber._backends.remote``).
     """
 
     __slots__ = ("__weakref__", "_file", "data", "digest")
 
     def __init__(self, data: BytesLike) -> None:
-        import hashlib  # most programs need none of it, nor what follows
+        import hashlib  # few programs need it
 
         self.digest = hashlib.sha256(data).digest()
         self.data = data
@@ -348,9 +349,10 @@ class Blob:
 
     @classmethod
     def in_file(cls, digest: bytes, data: BytesLike, directory: str | None) -> Blob:
-        """Return a blob that lies on disk, as the memory of an agent's pod is limited; OSError.
+        """Return a blob in a file on disk, because the memory of an agent's pod is limited.
 
-        The file has no name, so that none is left when the agent is killed.
+        The file has no name, so no file is left when the agent is killed.  OSError if it cannot be
+        written.
         """
         import tempfile
 
@@ -362,7 +364,7 @@ class Blob:
         return blob
 
     def fileno(self) -> int:
-        """The descriptor of a file that holds the bytes; it stays this object's."""
+        """Return the descriptor of a file that holds the bytes.  This object keeps it."""
         if self._file is None:
             file = opened(os.memfd_create, "fiber-blob")
             _write_all(file.fileno(), self.data)
@@ -379,7 +381,7 @@ def _write_all(fd: int, data: BytesLike) -> None:
 _SIMPLE = 0
 
 _MAPPED = 1 << 25
-"""Bytes from which the C library gives an object memory that belongs to no other."""
+"""Bytes from which the C library gives an object separate pages."""
 
 _COPY_STEP = 1 << 26
 """Bytes that one system call copies."""
@@ -427,18 +429,18 @@ _advise.argtypes = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int
 
 
 def copy_bytes(view: memoryview) -> bytes:
-    """``bytes(view)``, during which other threads run: to copy a gigabyte takes a second."""
+    """Return ``bytes(view)`` while other threads run: the copy of a gigabyte takes a second."""
     size = view.nbytes
     made: bytes = _new_bytes(None, size)
     if not made:
         return made
-    # A new object that no other code has seen may be written to.
+    # No other code has a reference to the new object yet, so it may be written to.
     target = _content(made)
     if _MAPPED <= size <= HUGE_PAGES_UP_TO:
         _use_huge_pages(target, size)
     memory = view.obj
     if isinstance(memory, Mapping) and memory.owner is not None:
-        # A read faults no page of the mapping, which would cost as much as the copy.
+        # Read the file: page faults in the mapping would cost as much as the copy.
         offset = address_of(view) - address_of(memoryview(memory))
         _read_into(memory.owner.fileno(), offset, target, size)
     else:
@@ -448,7 +450,7 @@ def copy_bytes(view: memoryview) -> bytes:
 
 def _use_huge_pages(start: int, size: int) -> None:
     begin = -(-start // mmap.PAGESIZE) * mmap.PAGESIZE
-    _advise(begin, start + size - begin, mmap.MADV_HUGEPAGE)  # fails where a kernel has none
+    _advise(begin, start + size - begin, mmap.MADV_HUGEPAGE)  # fails if the kernel has none
 
 
 def _read_into(fd: int, offset: int, target: int, size: int) -> None:

@@ -1,9 +1,9 @@
-"""The frames between the master and an agent.
+"""Frames between the master and an agent.
 
-Nothing here is unpickled: a frame is a few numbers and then opaque bytes, which only the process
-that they are meant for opens.  What it carries for the user stays out of its repr, and so of logs.
+A frame is a few numbers and then opaque bytes.  No code here unpickles them: only the process that
+gets them does.  The repr of a message, and so the log, does not show the user's data.
 
-Layout (little endian): version:u8, kind:u8, then each kind's own numbers and the rest.  Packets are
+Layout (little endian): version:u8, kind:u8, the numbers of that kind, and the rest.  A packet is
 count:u32, payload length:u64, buffer length:u64 * count, the payload, and each buffer at the next
 multiple of ALIGNMENT.
 """
@@ -20,14 +20,14 @@ from fiber._wire.packet import ALIGNMENT, INLINE_LIMIT
 from fiber.errors import FiberError
 
 PROTOCOL = 2
-"""Version of everything that master and agent say to each other; both must have the same."""
+"""Version of all messages between master and agent; both must have the same."""
 
 DIGEST_BYTES = 32
-"""Length of what names a blob: the SHA-256 of its bytes."""
+"""Length of a blob's name, the SHA-256 of its bytes."""
 
 
 class ProtocolError(FiberError):
-    """The other side of a link sent what it never should have."""
+    """Error: the other side of a link sent a frame that Fiber never sends."""
 
 
 class Start(NamedTuple):
@@ -38,11 +38,11 @@ class Start(NamedTuple):
     process: BytesLike
 
     def encode(self) -> bytes:
-        """The frame."""
+        """Return the frame."""
         return b"".join(self.pieces())
 
     def pieces(self) -> Sequence[BytesLike]:
-        """The frame, of which the Process is not copied."""
+        """Return the frame in pieces.  The Process is not copied."""
         head = _NUMBER.pack(PROTOCOL, _START, self.child)
         return _pieces(head, self.spec, [self.process])
 
@@ -51,17 +51,17 @@ class Start(NamedTuple):
 
 
 class KeepBlob(NamedTuple):
-    """Master to agent: keep this; Start frames name it by its digest until a Forget does."""
+    """Master to agent: keep this blob; Start frames name it by its digest until a Forget."""
 
     digest: bytes
     data: BytesLike
 
     def encode(self) -> bytes:
-        """The frame."""
+        """Return the frame."""
         return b"".join(self.pieces())
 
     def pieces(self) -> Sequence[BytesLike]:
-        """The frame, of which the data is not copied."""
+        """Return the frame in pieces.  The data is not copied."""
         return _BLOB_HEAD.pack(PROTOCOL, _BLOB, self.digest), self.data
 
     def __repr__(self) -> str:
@@ -74,17 +74,17 @@ class Forget(NamedTuple):
     digest: bytes
 
     def encode(self) -> bytes:
-        """The frame."""
+        """Return the frame."""
         return _BLOB_HEAD.pack(PROTOCOL, _FORGET, self.digest)
 
 
 class Lacking(NamedTuple):
-    """Agent to master: this blob is not here, and must be sent again for a child that needs it."""
+    """Agent to master: this blob is missing here; send it again before a child needs it."""
 
     digest: bytes
 
     def encode(self) -> bytes:
-        """The frame."""
+        """Return the frame."""
         return _BLOB_HEAD.pack(PROTOCOL, _LACKING, self.digest)
 
 
@@ -95,7 +95,7 @@ class Started(NamedTuple):
     pid: int
 
     def encode(self) -> bytes:
-        """The frame."""
+        """Return the frame."""
         return _NUMBERS.pack(PROTOCOL, _STARTED, self.child, self.pid)
 
 
@@ -106,7 +106,7 @@ class Signal(NamedTuple):
     signum: int
 
     def encode(self) -> bytes:
-        """The frame."""
+        """Return the frame."""
         return _NUMBERS.pack(PROTOCOL, _SIGNAL, self.child, self.signum)
 
 
@@ -119,11 +119,11 @@ class Deliver(NamedTuple):
     buffers: Sequence[BytesLike] = ()
 
     def encode(self) -> bytes:
-        """The frame."""
+        """Return the frame."""
         return b"".join(self.pieces())
 
     def pieces(self) -> Sequence[BytesLike]:
-        """The frame, of which the buffers and a large payload are not copied."""
+        """Return the frame in pieces.  The buffers and a large payload are not copied."""
         head = _DELIVERY.pack(PROTOCOL, _DELIVER, self.child, self.seq)
         return _pieces(head, self.payload, self.buffers)
 
@@ -139,11 +139,11 @@ class FromChild(NamedTuple):
     buffers: Sequence[BytesLike] = ()
 
     def encode(self) -> bytes:
-        """The frame."""
+        """Return the frame."""
         return b"".join(self.pieces())
 
     def pieces(self) -> Sequence[BytesLike]:
-        """The frame, of which the buffers and a large payload are not copied."""
+        """Return the frame in pieces.  The buffers and a large payload are not copied."""
         return _pieces(_NUMBER.pack(PROTOCOL, _FROM_CHILD, self.child), self.payload, self.buffers)
 
     def __repr__(self) -> str:
@@ -156,18 +156,18 @@ class Recall(NamedTuple):
     child: int
 
     def encode(self) -> bytes:
-        """The frame."""
+        """Return the frame."""
         return _NUMBER.pack(PROTOCOL, _RECALL, self.child)
 
 
 class Recalled(NamedTuple):
-    """Agent to master: these packets the child will never see."""
+    """Agent to master: the child will never receive these packets."""
 
     child: int
     seqs: tuple[int, ...]
 
     def encode(self) -> bytes:
-        """The frame."""
+        """Return the frame."""
         head = _NUMBER.pack(PROTOCOL, _RECALLED, self.child)
         return head + struct.pack(f"<{len(self.seqs)}Q", *self.seqs)
 
@@ -175,12 +175,12 @@ class Recalled(NamedTuple):
 class Exited(NamedTuple):
     """Agent to master: the child has ended.
 
-    The fields after ``delivered`` are those of an ExitReport, as far as an agent knows them.
+    The fields after ``delivered`` are those fields of an ExitReport that an agent knows.
     """
 
     child: int
     delivered: int
-    """Number of Deliver frames that reached the child.  It never saw those that came later."""
+    """Number of Deliver frames that reached the child.  Later ones did not."""
     exitcode: int
     reason: str
     unread: tuple[int, ...] = ()
@@ -191,7 +191,7 @@ class Exited(NamedTuple):
     stack: str = ""
 
     def encode(self) -> bytes:
-        """The frame."""
+        """Return the frame."""
         return _NUMBER.pack(PROTOCOL, _EXITED, self.child) + _json(self[1:])
 
     def __repr__(self) -> str:
@@ -205,7 +205,7 @@ class ChildOutput(NamedTuple):
     text: str
 
     def encode(self) -> bytes:
-        """The frame."""
+        """Return the frame."""
         return _NUMBER.pack(PROTOCOL, _OUTPUT, self.child) + _utf8(self.text)
 
     def __repr__(self) -> str:
@@ -213,29 +213,29 @@ class ChildOutput(NamedTuple):
 
 
 class TunnelOpen(NamedTuple):
-    """Either way: connect a new tunnel to the hub at ``target``."""
+    """Both directions: connect a new tunnel to the hub at ``target``."""
 
     tunnel: int
     target: str
 
     def encode(self) -> bytes:
-        """The frame."""
+        """Return the frame."""
         return _NUMBER.pack(PROTOCOL, _TUNNEL_OPEN, self.tunnel) + _utf8(self.target)
 
 
 class TunnelData(NamedTuple):
-    """Either way: a packet in a tunnel."""
+    """Both directions: a packet in a tunnel."""
 
     tunnel: int
     payload: BytesLike
     buffers: Sequence[BytesLike] = ()
 
     def encode(self) -> bytes:
-        """The frame."""
+        """Return the frame."""
         return b"".join(self.pieces())
 
     def pieces(self) -> Sequence[BytesLike]:
-        """The frame, of which the buffers and a large payload are not copied."""
+        """Return the frame in pieces.  The buffers and a large payload are not copied."""
         head = _NUMBER.pack(PROTOCOL, _TUNNEL_DATA, self.tunnel)
         return _pieces(head, self.payload, self.buffers)
 
@@ -244,24 +244,24 @@ class TunnelData(NamedTuple):
 
 
 class TunnelClose(NamedTuple):
-    """Either way: a tunnel ended, or could not be opened; ``reason`` is empty at an orderly end."""
+    """Both directions: a tunnel ended or was not opened; ``reason`` is empty at an orderly end."""
 
     tunnel: int
     reason: str = ""
 
     def encode(self) -> bytes:
-        """The frame."""
+        """Return the frame."""
         return _NUMBER.pack(PROTOCOL, _TUNNEL_CLOSE, self.tunnel) + _utf8(self.reason)
 
 
 class MemoryMessage(NamedTuple):
-    """Either way: about a block of shared memory that both hosts have."""
+    """Both directions: a message about a block of shared memory that both hosts have."""
 
     block: int
     payload: BytesLike
 
     def encode(self) -> bytes:
-        """The frame."""
+        """Return the frame."""
         return _NUMBER.pack(PROTOCOL, _MEMORY, self.block) + self.payload
 
     def __repr__(self) -> str:
@@ -269,26 +269,26 @@ class MemoryMessage(NamedTuple):
 
 
 class Shutdown(NamedTuple):
-    """Master to agent: end every child, within ``grace`` seconds by force, and then yourself."""
+    """Master to agent: end all children and then yourself; kill what is left after ``grace`` s."""
 
     grace: float
 
     def encode(self) -> bytes:
-        """The frame."""
+        """Return the frame."""
         return _GRACE.pack(PROTOCOL, _SHUTDOWN, self.grace)
 
 
 class Leave(NamedTuple):
-    """Agent to master: this agent takes no new work and goes, in ``grace`` seconds at the latest.
+    """Agent to master: this agent takes no new work and ends within ``grace`` seconds.
 
-    It closes the link once its last child is gone.
+    It closes the link after the end of its last child.
     """
 
     grace: float
     reason: str
 
     def encode(self) -> bytes:
-        """The frame."""
+        """Return the frame."""
         return _GRACE.pack(PROTOCOL, _LEAVE, self.grace) + _utf8(self.reason)
 
 
@@ -315,11 +315,11 @@ LinkMessage: TypeAlias = (
 
 
 HubMessage: TypeAlias = TunnelOpen | TunnelData | TunnelClose | MemoryMessage
-"""Messages between the hubs of both sides."""
+"""Message between the hubs of both sides."""
 
 
 def decode(frame: BytesLike) -> LinkMessage:
-    """Read a frame; ProtocolError says what is wrong with one that cannot be read.
+    """Read a frame; ProtocolError says what is wrong with a malformed frame.
 
     Payloads and buffers are views of ``frame``: not copied, and writable if it is a bytearray.
     """
@@ -336,7 +336,7 @@ def decode(frame: BytesLike) -> LinkMessage:
     try:
         return reader(memoryview(frame))
     except (struct.error, ValueError, TypeError, RecursionError) as error:
-        # Each of them is what its reader raises for bytes that its writer cannot have written.
+        # A reader raises each of these for bytes that no writer writes.
         name = reader.__name__.removeprefix("_read_")
         raise ProtocolError(
             f"a frame of kind {name} and {len(frame)} bytes is malformed ({error})"
@@ -357,17 +357,17 @@ _PACKET = struct.Struct("<IQ")
 
 
 def pieces(message: LinkMessage) -> Sequence[BytesLike]:
-    """A message's frame, in pieces if it has large ones: these are not copied."""
+    """Return a message's frame.  Large parts are separate pieces, which are not copied."""
     if isinstance(message, Start | KeepBlob | Deliver | FromChild | TunnelData):
         return message.pieces()
     return (message.encode(),)
 
 
 def lane(message: LinkMessage) -> Hashable:
-    """The lane that the message travels in.
+    """Return the lane of a message.  Messages of one lane keep their order.
 
-    Messages about one child's start and tasks keep their order, and so do those about one blob and
-    those of one tunnel.  A Signal is in no lane: it does not wait for what a child was sent.
+    The start and the tasks of a child share a lane, and so do the messages about one blob and those
+    of one tunnel.  A Signal has no lane: it does not wait for earlier messages to the child.
     """
     if isinstance(message, TunnelData | TunnelClose):
         return (_TUNNEL_DATA, message.tunnel)
@@ -379,8 +379,9 @@ def lane(message: LinkMessage) -> Hashable:
 
 
 def is_passed_on(frame: BytesLike) -> bool:
-    """Return whether the receiver of a frame, of which this is the beginning, may pass it on to
-    another process.  The master keeps what children send it.
+    """Tell by the first bytes of a frame whether its receiver may pass it on to another process.
+
+    The master does not pass on packets of children.
     """
     return bytes(frame[1:2]) != bytes([_FROM_CHILD])
 
@@ -390,7 +391,7 @@ def _pieces(head: bytes, payload: BytesLike, buffers: Sequence[BytesLike]) -> Se
     sizes = [view.nbytes for view in views]
     length = memoryview(payload).nbytes
     head += _PACKET.pack(len(sizes), length) + struct.pack(f"<{len(sizes)}Q", *sizes)
-    # A small payload may be borrowed.
+    # A small payload may be in borrowed memory, so it is copied.
     parts: list[BytesLike]
     parts = [head, payload] if length > INLINE_LIMIT else [b"".join((head, payload))]
     end = len(head) + length
@@ -571,7 +572,7 @@ _READERS: dict[int, Callable[[memoryview], LinkMessage]] = {
 
 
 def _redacted(message: tuple[Any, ...]) -> str:
-    """The repr of a message whose contents are the user's: sizes instead of values."""
+    """Return the repr of a message with the user's data: sizes instead of values."""
     values = zip(message._fields, message, strict=True)  # type: ignore[attr-defined]  # a NamedTuple
     inner = ", ".join(f"{name}={_shown(value)}" for name, value in values)
     return f"{type(message).__name__}({inner})"

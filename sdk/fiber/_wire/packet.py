@@ -1,17 +1,18 @@
 """Messages between two processes of one host: each is one ``SOCK_SEQPACKET`` packet.
 
 A packet arrives whole or not at all, also if several processes read or write the same socket.  So
-ends may be shared without a lock, and a reader that dies loses only its own message.  Small parts
-travel inside the packet.  Large parts lie in a memfd, whose descriptor travels with the packet.
+processes share an end without a lock, and a reader that dies loses only the message that it read.
+Small parts travel inside the packet.  Large parts lie in a memfd, whose descriptor travels with the
+packet.
 
 Layout (little endian)::
 
     kind:u8 = PLAIN     payload
     kind:u8 = PARTS     count:u32, payload length:u64, buffer lengths:u64 * count,
                         then payload and buffers, here or (IN_MEMFD) in the first descriptor
-    kind:u8 = PASSED    the same, then where each of them lies in the first descriptor:u64 (0 for
-                        the payload: here); they came from another host, and lie where they arrived
-    kind:u8 = WAKE_UP   no message: it says that a backlog has some (``fiber._hub.local``)
+    kind:u8 = PASSED    the same, then the offset of each in the first descriptor:u64 (0 for the
+                        payload: here); they came from another host and lie where they arrived
+    kind:u8 = WAKE_UP   no message: a backlog has messages (``fiber._hub.local``)
 
 Buffers are pickle protocol 5's out-of-band buffers (PEP 574).
 """
@@ -50,21 +51,22 @@ INLINE_LIMIT = 1 << 16
 """Bytes of payload and buffers up to which a packet carries them itself."""
 
 BULK = 1 << 18
-"""Bytes above which a blocking sender waits until its message is read, as it would on a pipe."""
+"""Bytes above which a blocking sender waits until its message is read, as on a pipe."""
 
 _BALLAST = memoryview(bytes(7 << 14))
-"""More than a quarter of a socket's buffer, where it stops being writable; also of one that has
-grown (net.core.wmem_default, doubled).
+"""Bytes that make a socket not writable: more than a quarter of its buffer.
+
+That also holds for a buffer that has grown (net.core.wmem_default, doubled).
 """
 
 OUT_OF_BAND_MIN = 1 << 16
 """Smaller buffers cost less inside the pickle than beside it."""
 
 MAX_DESCRIPTORS = 250
-"""The kernel takes 253 descriptors a packet; one is ours."""
+"""Limit of descriptors in a packet.  The kernel takes 253; the memfd needs one."""
 
 MAX_BUFFERS = 1024
-"""Out-of-band buffers of one message."""
+"""Limit of out-of-band buffers in a message."""
 
 PLAIN = b"\x00"
 PARTS = 1
@@ -94,7 +96,7 @@ _Received: TypeAlias = list[Any]
 
 
 class _ReceiveBuffer:
-    """Memory to receive into, and the arguments of ``recvmsg_into`` for it."""
+    """Memory to receive a packet into, and the arguments of ``recvmsg_into`` for it."""
 
     __slots__ = ("call", "data", "view")
 
@@ -105,7 +107,7 @@ class _ReceiveBuffer:
 
 
 class WakeUp(Exception):
-    """A wake-up packet came in place of a message; with the descriptor that was in it."""
+    """Signal that a wake-up packet came in place of a message; ``sender`` is its descriptor."""
 
     def __init__(self, sender: Descriptor) -> None:
         super().__init__()
@@ -113,7 +115,7 @@ class WakeUp(Exception):
 
 
 class NothingYet(BlockingIOError):
-    """A receiver's time limit was over before a message came."""
+    """Error: no message came within the receiver's time limit."""
 
 
 class _FreeBuffers(threading.local):
@@ -128,9 +130,9 @@ _arena = Arena()
 
 
 class Message:
-    """A received packet.
+    """Received packet.
 
-    ``payload`` of a small one is borrowed: call ``release`` (or ``loads``) soon.
+    A small ``payload`` is in memory of this thread: call ``release`` (or ``loads``) soon.
     """
 
     __slots__ = ("_buffer", "buffers", "fds", "payload")
@@ -148,7 +150,7 @@ class Message:
         self._buffer = buffer
 
     def release(self) -> None:
-        """Give the borrowed memory back to this thread; the payload must not be used after it."""
+        """Give the memory back to this thread.  The payload must not be used afterwards."""
         buffer, self._buffer = self._buffer, None  # first: a signal must not give it back twice
         if buffer is not None:
             _buffers.free.append(buffer)
@@ -161,15 +163,16 @@ class Message:
         return data
 
     def close_descriptors(self) -> None:
-        """Close the descriptors that came with the packet and were not taken."""
+        """Close the descriptors of the packet that the caller did not take."""
         for fd in self.fds:
             os.close(fd)
         self.fds = []
 
 
 def dumps(obj: Any, dump: Callable[..., bytes] = pickle.dumps) -> tuple[bytes, list[memoryview]]:
-    """Pickle ``obj``; large contiguous buffers in it (NumPy arrays) are returned beside the
-    pickle, and so are large bytes that it is or that it has as an argument or element.
+    """Pickle ``obj``; return the pickle and its large contiguous buffers (NumPy arrays).
+
+    If ``obj`` is large bytes, or a tuple that contains large bytes, these are buffers too.
     """
     buffers: list[memoryview] = []
 
@@ -184,12 +187,12 @@ def dumps(obj: Any, dump: Callable[..., bytes] = pickle.dumps) -> tuple[bytes, l
 
 
 def kept(buffers: Sequence[memoryview]) -> list[memoryview]:
-    """Copy those buffers that their owner may change."""
+    """Return the buffers, with a copy of each that its owner may change."""
     return [view if type(view.obj) is bytes else memoryview(bytes(view)) for view in buffers]
 
 
 class _Large:
-    """Stands for bytes that no pickle has to copy."""
+    """Placeholder for large bytes, which the pickle does not copy."""
 
     __slots__ = ("_data",)
 
@@ -201,14 +204,14 @@ class _Large:
 
 
 def large_bytes(buffer: BytesLike) -> bytes:
-    """Return the bytes for which a ``_Large`` stood."""
-    if isinstance(buffer, bytes):  # they were pickled after all
+    """Return the bytes of a ``_Large``.  Unpickling calls it."""
+    if isinstance(buffer, bytes):  # they are part of the pickle
         return buffer
     return copy_bytes(memoryview(buffer))
 
 
 def _light(obj: Any, known: dict[int, _Large], depth: int = 2) -> Any:
-    """Replace large bytes: ``obj`` itself, and those in tuples, of which calls consist."""
+    """Replace large bytes by ``_Large``: ``obj`` itself, and bytes in tuples."""
     kind = type(obj)
     if kind is bytes and len(obj) >= OUT_OF_BAND_MIN:
         return known.setdefault(id(obj), _Large(obj))
@@ -238,11 +241,11 @@ def send(
     """Send one packet.
 
     Without ``wait``, or on a non-blocking socket, BlockingIOError means that nothing was sent.
-    BrokenPipeError: no one can ever read it.  ``fds`` (at most MAX_DESCRIPTORS) are duplicated into
-    the process that receives the packet.
+    BrokenPipeError means that no process can ever read the packet.  ``fds`` (at most
+    MAX_DESCRIPTORS) are duplicated into the process that receives the packet.
 
-    With ``ballast`` a message above BULK weighs enough in the socket's buffer that the socket is
-    not writable until the message is read; True says that it was such a message.
+    With ``ballast``, a message above BULK fills so much of the socket's buffer that the socket is
+    not writable until the message is read.  Return True for such a message.
     """
     size = _size(payload)
     flags = 0 if wait else _DONTWAIT_TO_SEND
@@ -272,7 +275,7 @@ def send(
 
 
 def is_bulky(payload: BytesLike, buffers: Sequence[memoryview]) -> bool:
-    """Return whether a message is above BULK."""
+    """Tell whether a message is larger than BULK."""
     return size_of(payload, buffers) > BULK
 
 
@@ -286,7 +289,7 @@ def _size(payload: BytesLike) -> int:
 
 
 def check_buffers(buffers: Sequence[memoryview]) -> None:
-    """ValueError if a message cannot have so many."""
+    """Raise ValueError if a message has too many buffers."""
     if len(buffers) > MAX_BUFFERS:
         raise ValueError(
             f"a message has {len(buffers)} out-of-band buffers; at most {MAX_BUFFERS} are sent"
@@ -320,7 +323,7 @@ def _send_parts(
     except BlockingIOError:
         _arena.settle(block, sent=False)
         raise
-    # What else is raised may be a signal's handler's, after it was sent: the block is forgotten.
+    # Any other error may come from a signal's handler after the packet was sent: forget the block.
     _arena.settle(block, sent=True)
 
 
@@ -333,7 +336,10 @@ def _pass_on(
     ballast: BytesLike,
     flags: int,
 ) -> bool:
-    """Send the descriptor of the memory in which the parts arrived; False if they lie elsewhere."""
+    """Send the descriptor of the memory in which the parts arrived from another host.
+
+    Return False if they lie elsewhere.
+    """
     inline = sizes[0] <= INLINE_LIMIT
     offsets = [0] * inline
     owner = None
@@ -378,9 +384,9 @@ def _offsets(sizes: Sequence[int]) -> tuple[list[int], int]:
 
 
 def receive_object(sock: socket.socket) -> Any:
-    """``loads(receive(sock))``, without a Message between them where the packet is a small one.
+    """Return ``loads(receive(sock))``; for a small packet without a Message between them.
 
-    NothingYet on a socket whose receivers wait for a limited time.
+    NothingYet on a socket with a time limit for receivers.
     """
     free = _buffers.free
     buffer = free.pop() if free else _ReceiveBuffer()
@@ -408,13 +414,14 @@ def receive(
     passing: bool = False,
     then: Callable[[], None] | None = None,
 ) -> Message:
-    """Receive one packet; ConnectionClosed when no one can ever send again.
+    """Receive one packet; ConnectionClosed if no process can ever send again.
 
-    Without ``wait``, or on a non-blocking socket, BlockingIOError says that there is none.
-    ``descriptors`` makes room for those that the sender attached; without it only the memfd of a
-    large message is taken.  ``passing``: it is passed on or copied soon, so that a large one may
-    stay where its sender wrote it, who has no other use for that memory until then.  ``then`` is a
-    function of C that is called as soon as there is a packet: no signal's handler runs in between.
+    Without ``wait``, or on a non-blocking socket, BlockingIOError means that there is no packet.
+    ``descriptors`` makes room for descriptors that the sender attached; without it only the memfd
+    of a large message is taken.  ``passing`` says that the caller passes the message on or copies
+    it soon: a large one then stays in the sender's memory, which the sender does not reuse until
+    then.  ``then`` is a C function, called as soon as there is a packet: no signal's handler runs
+    in between.
     """
     space = _ANCILLARY if descriptors else _ANCILLARY_ONE
     free = _buffers.free
@@ -427,7 +434,7 @@ def receive(
         raise
     size = received[0][0]
     if size and not buffer.data[0]:
-        if size > INLINE_LIMIT + 1:  # by its size it would be taken for memory of its own
+        if size > INLINE_LIMIT + 1:  # ``tobytes`` would take it for separate memory
             free.append(buffer)
             raise ValueError(f"a small message of {size} bytes")
         return Message(buffer.view[1:size], [], [], buffer)
@@ -442,14 +449,14 @@ def _recvmsg(
 ) -> _Received:
     received: _Received = []
     try:
-        # Received and noted in one step: in between a signal's handler could lose descriptors.
+        # Receive and note it in one step: between steps a signal's handler could lose descriptors.
         try:
             received.extend(
                 _receiving(sock, call, then) if then else starmap(sock.recvmsg_into, call)
             )
         except ConnectionResetError:
-            # The peer closed before it had read our packets.  The kernel says so once, before it
-            # delivers the peer's own packets.  The next call returns those, or the end.
+            # The peer closed before it had read all packets of this side.  The kernel reports that
+            # once, before it delivers the peer's packets.  The next call returns these, or the end.
             received.extend(_receiving(sock, call, then))
         ancillary = received[0][1]
         if ancillary and data[0] in (PARTS_IN_MEMFD, PASSED, WAKE_UP):
@@ -470,7 +477,7 @@ def _receiving(sock: socket.socket, call: _Call, then: Callable[[], None] | None
 
 
 def _rights(ancillary: _Ancillary) -> list[int]:
-    """The descriptors that came along."""
+    """Return the descriptors that came with the packet."""
     return [
         fd
         for level, kind, data in ancillary
@@ -489,7 +496,7 @@ def _receive_parts(
         if not size:
             raise ConnectionClosed()
         if flags & socket.MSG_CTRUNC:
-            # Descriptors were attached and this process had no room for them.
+            # The sender attached descriptors, and this process may open no more files.
             raise TooManyOpenFiles("receiving a descriptor")
         kind, count, length = _PARTS.unpack_from(view)
         if kind == WAKE_UP and memory:
@@ -521,8 +528,10 @@ def _inline_parts(body: memoryview, sizes: list[int], message: Message) -> Messa
 def _memory_parts(
     sizes: list[int], message: Message, memory: Descriptor, *, passing: bool
 ) -> Message:
-    """Take the parts out of the sender's block: by a copy that frees it, or for good if it is
-    large.  A caller that is ``passing`` them on may use them in place.
+    """Return the parts in the sender's block.
+
+    They are copied, which frees the block.  A large block is mapped instead, and not reused.  A
+    caller that is ``passing`` them on may use them in place.
     """
     offsets, total = _offsets(sizes)
     mapped = in_place(memory, total) if passing else None
@@ -541,7 +550,7 @@ def _memory_parts(
 def _passed_parts(
     rest: memoryview, sizes: list[int], message: Message, memory: Descriptor
 ) -> Message:
-    """Map the parts, which have no other user, or copy them if they are not large."""
+    """Return parts that came from another host: mapped if they are large, else copied."""
     table = _SIZE.size * len(sizes)
     offsets = [offset for (offset,) in _SIZE.iter_unpack(rest[:table])]
     places = list(zip(offsets, sizes, strict=True))

@@ -6,22 +6,22 @@ To a worker (behind the sequence number that its agent put in front)::
     CALLS       head, (size:u64, buffers:u32) * count, a pickled (function, args, kwargs) each
     STOP        head
 
-A large pickle is the first of its buffers instead, with BESIDE as its size.  Items have no size:
-nothing follows the function then.
+A large pickle is the first of its buffers instead, with BESIDE as its size.  The size of the items
+is not sent, as they are the rest of the message.
 
 From a worker, pickled tuples of plain values, so that reading one never runs the user's code::
 
     (seq, offset, kept, seconds, values, odd)   results of batch seq, its tasks from offset on
     (UNREADABLE, seq, error)                    its message does not unpickle
-    (UNKNOWN, seq)                              its function was forgotten, or never seen
+    (UNKNOWN, seq)                              the worker does not have its function
     (BROKEN, seq, error)                        its function does not unpickle
-    (READY,)  (INIT_FAILED, text)               initialized; failed before that
+    (READY,)  (INIT_FAILED, text)               the initializer returned; it failed
 
-``kept`` is how many tasks of the batch the worker keeps, one at least, or None for all: it gives
-the others back.
-``values`` holds plain values; what is not plain is None there and stands in ``odd`` as (position
-in values, VALUE | ERROR | AGAIN, pickle, number of buffers), AGAIN being an error after which the
-pool was told to run the task again.  A large pickle is the first of its buffers, and None here.
+``kept`` is the number of tasks of the batch that the worker keeps, one at least, or None for all.
+The worker gives the other tasks back.
+``values`` holds plain values.  In place of any other value it holds None, and ``odd`` holds
+(position in values, VALUE | ERROR | AGAIN, pickle, number of buffers).  AGAIN is an error after
+which the pool runs the task again.  A large pickle is the first of its buffers, and None here.
 ``error`` is such a pickle.
 """
 
@@ -47,7 +47,7 @@ CALL = struct.Struct("<QI")
 NUMBERS = frozenset({int, float, complex, bool, type(None)})
 _TEXTS = frozenset({str, bytes})
 PLAIN = NUMBERS | _TEXTS
-"""Immutable, and pickled and unpickled without running anyone's code."""
+"""Immutable types that pickle and unpickle without running the user's code."""
 
 _ROWS = frozenset({tuple, list})
 
@@ -57,15 +57,15 @@ class Head(NamedTuple):
 
     kind: int
     stride: int
-    """Tasks from one note of the worker's progress to the next; 0: each result is pickled, or
-    plain, as soon as it is there."""
+    """Tasks between two notes of the worker's progress.  0: the worker prepares each result as soon
+    as it has it."""
     unit: int
-    """Tasks that stay together."""
+    """Number of tasks that stay together."""
     function: int
     size: int
-    """Bytes of the pickled function, 0 if the worker has it; for CALLS their number."""
+    """Bytes of the pickled function, 0 if the worker has it; for CALLS the number of calls."""
     buffers: int
-    """Buffers of the message that belong to the function."""
+    """Number of the message's buffers that belong to the function."""
 
 
 BESIDE = (1 << 64) - 1
@@ -75,17 +75,17 @@ BODY = SEQ.size + HEAD.size
 """Offset of the part after the head."""
 
 BUFFERS = 256
-"""An object with more large buffers than this is pickled as a whole."""
+"""Limit of large buffers.  An object with more is pickled as a whole."""
 
 STOP_MESSAGE = HEAD.pack(STOP, 0, 1, 0, 0, 0)
 
 
 Pickle = tuple[bytes, Sequence[memoryview]]
-"""A pickle and the buffers beside it."""
+"""Pickle, and the buffers beside it."""
 
 
 def beside(pickle: Pickle) -> Pickle:
-    """Move a large pickle to its buffers, so that nothing on its way has to copy it."""
+    """Move a large pickle to its buffers, so that it is not copied on its way."""
     data, buffers = pickle
     if len(data) <= INLINE_LIMIT:
         return pickle
@@ -93,12 +93,12 @@ def beside(pickle: Pickle) -> Pickle:
 
 
 def found(data: BytesLike | None, buffers: list[memoryview]) -> tuple[BytesLike, list[memoryview]]:
-    """Return a pickle, which is the first of its buffers if ``data`` is None, and the others."""
+    """Undo ``beside``: return a pickle and its other buffers."""
     return (buffers[0], buffers[1:]) if data is None else (data, buffers)
 
 
 def pack_calls(calls: Sequence[Pickle]) -> bytes:
-    """A message of calls that are already pickled, and went through ``beside``."""
+    """Return a message of pickled calls that went through ``beside``."""
     if len(calls) == 1:
         data, buffers = calls[0]
         return HEAD.pack(CALLS, 0, 1, 0, 1, 0) + _entry(data, buffers) + data
@@ -112,7 +112,10 @@ def _entry(data: bytes, buffers: Sequence[memoryview]) -> bytes:
 
 
 def unpack_calls(body: memoryview, count: int) -> Iterable[tuple[memoryview | None, int]]:
-    """The pickles in a message of calls, each with its number of buffers; None for one beside."""
+    """Yield the pickles in a message of calls, each with its number of buffers.
+
+    None stands for a pickle that is the first of its buffers.
+    """
     start = CALL.size * count
     for size, buffers in CALL.iter_unpack(body[:start]):
         if size == BESIDE:
@@ -123,13 +126,14 @@ def unpack_calls(body: memoryview, count: int) -> Iterable[tuple[memoryview | No
 
 
 def pack_batch(head: Head, function: bytes, items: BytesLike) -> bytes:
-    """A message of one function and the items to apply it to."""
+    """Return a message of one function and the items to apply it to."""
     return b"".join((HEAD.pack(*head), function, items))
 
 
 def is_plain(items: Sequence[Any]) -> bool:
-    """Return whether pickling ``items`` runs none of the user's code and takes no time: plain
-    values that are not large, or rows of them.
+    """Tell whether pickling ``items`` is fast and runs none of the user's code.
+
+    That holds for plain values that are not large, and for rows of them.
     """
     if type(items) is range:
         return True
@@ -143,7 +147,7 @@ def is_plain(items: Sequence[Any]) -> bool:
 
 
 def is_plain_value(value: Any) -> bool:
-    """Return whether ``value`` is plain: to keep as it is, pickle later and unpickle anywhere."""
+    """Tell whether ``value`` is plain: it may be kept, pickled later, and unpickled anywhere."""
     kind = type(value)
     if kind is tuple:
         return PLAIN.issuperset(map(type, value)) and not _has_large(value)
