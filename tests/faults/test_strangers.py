@@ -124,7 +124,7 @@ def test_a_crowd_of_strangers_does_not_take_the_masters_descriptors(
     program.process.stdin.write(b"end\n")
     program.process.stdin.close()
     program.finish()
-    assert program.stderr.count("too many come at the same time") <= 1
+    assert program.stderr.count("too many connections come at the same time") <= 1
 
 
 def test_tls_without_a_proof_gets_no_word(backend: LoopbackBackend) -> None:

@@ -167,7 +167,7 @@ def test_a_crowd_from_one_address_is_bounded_and_keeps_nobody_out(
     master.wait(lambda: master.frames)
     for visitor in crowd[:4]:
         visitor.close()
-    assert any("too many come at the same time" in told for told in master.refusals)
+    assert any("too many connections come at the same time" in told for told in master.refusals)
 
 
 class ScarceListener:
@@ -302,7 +302,7 @@ def test_an_agent_without_a_pod_is_told_of_whatever_strangers_do(
     site.on_loop(lambda: None)  # the agent waits for its pod now
     pass_time(listener, PATIENCE)
     master.wait(lambda: master.refusals)
-    assert master.refusals[0].startswith("there is no pod 'agent-1' yet, and it was waited for")
+    assert master.refusals[0].startswith("there is no pod 'agent-1' yet, and there was none within")
 
 
 def test_a_crowd_is_told_of_once_from_wherever_it_comes(
@@ -322,7 +322,9 @@ def test_a_crowd_is_told_of_once_from_wherever_it_comes(
         assert ours.recv(1) == b""
         ours.close()
     site.on_loop(lambda: None)
-    assert master.refusals == ["10.0.0.0:1 was turned away: too many come at the same time"]
+    assert master.refusals == [
+        "10.0.0.0:1 was turned away: too many connections come at the same time"
+    ]
 
 
 def test_complaints_are_bounded(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -196,10 +196,10 @@ def test_both_speak_at_once_so_that_each_knows_that_the_connection_works() -> No
     one, other = LinkProtocol(0), LinkProtocol(0)
     one.connected(0)
     other.connected(0)
-    assert not other.heard
+    assert not other.has_received
     (datagram,) = one.outgoing(0)
     assert other.received(datagram, 0) == []
-    assert other.heard
+    assert other.has_received
 
 
 def test_frames_that_wait_travel_in_one_datagram() -> None:

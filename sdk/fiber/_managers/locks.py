@@ -345,8 +345,8 @@ class ClientThread:
 def _released_text(lock: Any, holder: str) -> str:
     kind = "rlock" if isinstance(lock, ManagedRLock) else type(lock).__name__.lower()
     return (
-        f"{holder} ended while it held this {kind} of a manager, "
-        "which was released: what it protects may be half changed"
+        f"{holder} ended while it held this {kind} of a manager. The manager has released it. The "
+        "data that it guards may be half changed: check that before you rely on it"
     )
 
 

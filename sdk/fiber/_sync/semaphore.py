@@ -524,8 +524,8 @@ def semaphore_at(address: int, kind: int = COUNTING, maximum: int = SEM_VALUE_MA
 def warn_of(holder: str, *, stacklevel: int = 2) -> None:
     """Warn that the process ``holder`` ended with a token."""
     warnings.warn(
-        f"{holder} ended while it held a lock or semaphore, which is released: what it guards may "
-        "be half changed",
+        f"{holder} ended while it held a lock or semaphore. Fiber has released it. The data that "
+        "it guards may be half changed: check that before you rely on it",
         RuntimeWarning,
         stacklevel=stacklevel,
     )

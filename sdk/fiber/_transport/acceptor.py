@@ -6,7 +6,7 @@ them all.  Nothing on this thread blocks, OpenSSL runs without the interpreter's
 peer delays only itself.
 
 ``Admission`` limits pending connections, so that strangers neither use up the program's descriptors
-nor keep agents waiting.  One limit holds for all pending connections and one for those from one
+nor keep agents waiting.  One limit holds for all pending connections, another for those from one
 address.  At a limit, a newcomer replaces the oldest connection: from the same address, or else from
 the address with the most connections.  A connection is not replaced before it has had a fair
 chance.
@@ -72,15 +72,15 @@ class ServedPool(NamedTuple):
     on_agent: Callable[[PendingConnection, AgentHello], None]
     """Called with a connection that has proved to be an agent of the pool."""
     on_refused: Callable[[str], None]
-    """Called with why a connection was turned away, once in some minutes for each address and
-    reason. Strangers from many addresses are summed up."""
+    """Called with the reason for refusing a connection, once in some minutes for each address and
+    reason.  Strangers from many addresses are summed up."""
 
 
 class Acceptor:
     """Listens on ``address``, for the agents of any number of pools.
 
-    Port 0 is a free one, and a range such as 9000-9009 the first of them that is free; ``address``
-    then says which.  Connections are taken once there is a pool.
+    Port 0 takes a free port, and a range such as 9000-9009 its first free port; the attribute
+    ``address`` has the port.  Connections are accepted once there is a pool.
 
     All pools show the same ``certificate``.  An agent does not name its pool: the key of its proof
     tells the pool (decision 6).  A stranger has no pool, and is reported to the first one.
@@ -93,7 +93,7 @@ class Acceptor:
         self._lock = threading.Lock()
         self._pools: tuple[ServedPool, ...] = ()
         self._past: tuple[ServedPool, ...] = ()
-        """Pools that were removed.  Their agents are told so, not reported as strangers."""
+        """Pools that were removed.  Their agents get that as the reason, and are no strangers."""
         self._refusals = Refusals()
         descriptors = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
         most = min(_MOST, max(descriptors // 4, 2))
@@ -138,14 +138,14 @@ class Acceptor:
     def report(
         self, host: str, origin: str, reason: str, *, pool: ServedPool | None = None
     ) -> None:
-        """Say that a connection was turned away: an agent of ``pool``, or a stranger."""
+        """Report that a connection was refused: an agent of ``pool``, or a stranger."""
         own = pool is not None
         if news := self._refusals.news(host, origin, reason, self.loop.now(), own=own):
-            for told in (pool,) if pool else self._pools[:1]:
-                told.on_refused(news)
+            for served in (pool,) if pool else self._pools[:1]:
+                served.on_refused(news)
 
     def pool_of(self, believes: Callable[[MasterCredentials], bool]) -> ServedPool | None:
-        """Return the pool whose credentials are believed."""
+        """Return the pool with the credentials for which ``believes`` is true."""
         for pool in (*self._pools, *self._past):
             if believes(pool.credentials):
                 return pool
@@ -170,11 +170,11 @@ class Acceptor:
                 if error.errno in _SHORT_OF_DESCRIPTORS:
                     self._pause(error)
                     return
-                continue  # that connection broke before it was taken
+                continue  # that connection broke before it was accepted
             self._admit(sock, host, join_address(host, port))
 
     def _pause(self, error: OSError) -> None:
-        self.report("", "whoever comes now", f"{error.strerror}; it is tried again all the time")
+        self.report("", "new connections", f"{error.strerror}; Fiber tries again all the time")
         self.loop.unregister(self._listener.fileno())
         self.loop.call_later(_PAUSE, self._resume)
 
@@ -186,9 +186,9 @@ class Acceptor:
         connection = PendingConnection(self, host, origin)
         admitted, leaves = self._admission.enter(connection, host, self.loop.now())
         if isinstance(leaves, PendingConnection):
-            leaves.refuse("it said nothing, and others want to come in")
+            leaves.refuse("it sent nothing while other connections waited")
         if not admitted:
-            self.report("", origin, "too many come at the same time")
+            self.report("", origin, "too many connections come at the same time")
             sock.close()
             return
         self._pending.add(connection)
@@ -254,7 +254,7 @@ class PendingConnection:
         self._part()
 
     def waits_for(self, what: str) -> None:
-        """Note what the connection waits for until its deadline.  Any thread."""
+        """Note what the agent waits for, as the reason if the deadline passes.  Any thread."""
         self._awaited = what
 
     def drop(self) -> None:
@@ -264,7 +264,7 @@ class PendingConnection:
     def welcome(self, greeting: bytes, then: Callable[[int, Secrets], None]) -> None:
         """Answer the agent and end TLS.  Any thread.
 
-        ``then`` gets the connection, on the acceptor's thread.
+        ``then`` is called with the connection, on the acceptor's thread.
         """
         self._loop.call_soon(self._answer, greeting, lambda end: then(*end))
 
@@ -367,8 +367,8 @@ class PendingConnection:
             self.hang_up()
 
     def _too_late(self) -> None:
-        if self._awaited:  # by one that has proved itself: no number of strangers suppresses that
-            self.report_proven(f"{self._awaited}, and it was waited for {_DEADLINE:g} s")
+        if self._awaited:  # a proven agent: no number of strangers suppresses this report
+            self.report_proven(f"{self._awaited}, and there was none within {_DEADLINE:g} s")
             self.hang_up()
         else:
             self.refuse(f"it did not prove itself within {_DEADLINE:g} s")
@@ -383,7 +383,7 @@ def _turn_away(connection: PendingConnection, hello: AgentHello) -> None:
 def _listen(address: str) -> socket.socket:
     host, _, ports = address.rpartition(":")
     first, _, last = ports.partition("-")
-    # The last error is raised: what is wrong with the host is wrong at each port.
+    # Raise the last error: a wrong host is wrong at each port.
     for port in range(int(first), int(last)) if last else ():
         with contextlib.suppress(LinkError):
             return _listen_at(address, host.strip("[]"), port)
@@ -401,8 +401,9 @@ def _listen_at(address: str, host: str, port: int) -> socket.socket:
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
             raise LinkError(
-                f"cannot listen on {address}: another program uses that port, or all of "
-                "several. Stop it, or choose another port; port 0 takes a free one."
+                f"cannot listen on {address}: another program uses that port, or other programs "
+                "use all ports of the range. Stop one of them, or choose another port; port 0 "
+                "takes a free one."
             ) from error
         if error.errno == errno.EADDRNOTAVAIL:
             raise LinkError(
@@ -495,39 +496,39 @@ class Refusals:
     def __init__(self) -> None:
         self._strangers: dict[tuple[str, str], float] = {}
         self._own: dict[tuple[str, str], float] = {}
-        self._untold = 0
+        self._suppressed = 0
         self._next_summary = 0.0
 
     def news(self, host: str, origin: str, reason: str, now: float, *, own: bool = False) -> str:
-        """Return the line to log for a refusal; empty if the same was logged lately.
+        """Return the text to log for a refusal; empty if the same was logged lately.
 
         ``own`` marks a refusal of an agent of the program: no number of strangers suppresses it.
         """
-        told = self._own if own else self._strangers
-        _forget(told, now)
-        if (host, reason) in told:
+        logged = self._own if own else self._strangers
+        _forget(logged, now)
+        if (host, reason) in logged:
             return ""
-        if len(told) >= _REMEMBERED:
+        if len(logged) >= _REMEMBERED:
             if not own:
                 return self._summary(origin, reason, now)
-            del told[next(iter(told))]
-        told[host, reason] = now
+            del logged[next(iter(logged))]
+        logged[host, reason] = now
         return f"{reason} ({origin})" if own else f"{origin} was turned away: {reason}"
 
     def _summary(self, origin: str, reason: str, now: float) -> str:
-        self._untold += 1
+        self._suppressed += 1
         if now < self._next_summary:
             return ""
-        count, self._untold = self._untold, 0
+        count, self._suppressed = self._suppressed, 0
         self._next_summary = now + _FORGET
         return (
             f"strangers come from many addresses: {count} more turned away, the last was {origin} "
-            f"({reason}). The next line about them comes in {_FORGET / 60:.0f} minutes"
+            f"({reason}). The next message about them comes in {_FORGET / 60:.0f} minutes"
         )
 
 
-def _forget(told: dict[tuple[str, str], float], now: float) -> None:
-    for refusal, when in list(told.items()):
+def _forget(logged: dict[tuple[str, str], float], now: float) -> None:
+    for refusal, when in list(logged.items()):
         if now - when < _FORGET:
-            return  # the others were told later
-        del told[refusal]
+            return  # the others were logged later
+        del logged[refusal]

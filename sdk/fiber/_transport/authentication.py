@@ -144,14 +144,17 @@ def decode_greeting(datagram: bytes) -> Greeting:
         fields = json.loads(datagram[1:])
         return reader(_identity(fields["identity"]), fields)
     except _UNREADABLE as error:
-        # Whatever JSON holds instead of what belongs there.
+        # JSON of the wrong shape.
         raise ProtocolError(
             f"its greeting is malformed ({type(error).__name__}: {error})"
         ) from None
 
 
 def version_mismatch(ours: Identity, theirs: Identity) -> VersionMismatch | None:
-    """Why these two cannot work together: pickles and messages cross, so both must be equal."""
+    """Return an error if the two sides cannot work together, else None.
+
+    They exchange pickles and messages, so Python's and the protocol's versions must be equal.
+    """
     if ours.protocol != theirs.protocol:
         return VersionMismatch(
             "Fiber protocol",
@@ -286,11 +289,11 @@ _PROOF_SIZE = 32
 
 
 class Untrusted(Exception):
-    """The peer could not prove what it had to, or did not believe us, or speaks no TLS 1.3."""
+    """Error: the peer has no valid proof, refused the proof of this side, or has no TLS 1.3."""
 
 
 class HungUp(Exception):
-    """The peer ended the connection in the middle."""
+    """Error: the peer closed the connection during the handshake."""
 
 
 class _TakenSocket(ssl.SSLSocket):
@@ -307,7 +310,7 @@ class _TakenSocket(ssl.SSLSocket):
 def master_context(certificate: Certificate) -> ssl.SSLContext:
     """Return the context of a master; AuthenticationError if ``certificate`` cannot be used."""
     context = _context(ssl.PROTOCOL_TLS_SERVER)
-    context.num_tickets = 0  # nobody resumes, and nothing must follow the handshake
+    context.num_tickets = 0  # no side resumes a session, and no bytes may follow the handshake
     try:
         _load_own(context, certificate)
     except (ssl.SSLError, ValueError) as error:
@@ -332,7 +335,7 @@ def _context(protocol: int) -> ssl.SSLContext:
 
 
 def _load_own(context: ssl.SSLContext, certificate: Certificate) -> None:
-    # The ssl module takes them from a file only; this one is in memory and has no name.
+    # The ssl module reads them only from a file.  This file is in memory and has no name.
     file = os.memfd_create("credentials")
     try:
         with open(file, "wb", closefd=False) as writer:
@@ -343,7 +346,7 @@ def _load_own(context: ssl.SSLContext, certificate: Certificate) -> None:
 
 
 class _Handshake:
-    """Handshake of one side on ``sock``, which it takes over and makes non-blocking.
+    """Handshake of one side.  It takes over ``sock`` and makes it non-blocking.
 
     HungUp if the connection has broken already.
     """
@@ -367,23 +370,26 @@ class _Handshake:
             raise HungUp(_words(error)) from error
 
     def end(self) -> Steps[tuple[int, Secrets]]:
-        """End TLS in order: the bare connection's descriptor, now the caller's, and the secrets."""
+        """End TLS in order; return the descriptor of the bare connection and the secrets.
+
+        The caller owns the descriptor.
+        """
         yield from self._when_ready(self.sock.unwrap)
         return self.sock.detach(), derive(*self._nonces, for_master=self._for_master)
 
     def close(self) -> None:
-        """Hang up."""
+        """Close the connection."""
         self.sock.close()
 
     @property
     def _nonces(self) -> tuple[bytes, bytes]:
-        """The random bytes of the agent and of the master."""
+        """Random bytes of the agent and of the master."""
         if self._for_master:
             return self._theirs, self._ours
         return self._ours, self._theirs
 
     def _proof(self, side: bytes, key: str, certificate: bytes, words: bytes) -> bytes:
-        """Compute what ``side`` proves, while it says ``words``."""
+        """Compute the proof of ``side`` for the greeting ``words``."""
         agent, master = self._nonces
         said = b"fiber " + side + agent + master + certificate + words
         return hmac.digest(bytes.fromhex(key), said, "sha256")
@@ -427,12 +433,12 @@ class _Handshake:
 
 
 class AgentHandshake(_Handshake):
-    """The agent's part."""
+    """Handshake of the agent."""
 
     _for_master = False
 
     def ask(self, credentials: Credentials, hello: bytes) -> Steps[bytes]:
-        """Prove each other, say ``hello``, and return the answer."""
+        """Send ``hello`` with a proof; check the master's proof and return its answer."""
         yield from self._when_ready(self.sock.do_handshake)
         seen = hashlib.sha256(self.sock.getpeercert(binary_form=True) or b"").digest()
         if credentials.master and seen.hex() != credentials.master:
@@ -450,7 +456,7 @@ class AgentHandshake(_Handshake):
 
 
 class MasterHandshake(_Handshake):
-    """The master's part."""
+    """Handshake of the master."""
 
     _for_master = True
 
@@ -463,7 +469,7 @@ class MasterHandshake(_Handshake):
         self._words = self._said = b""
 
     def listen(self) -> Steps[bytes]:
-        """Return the agent's hello, which is not proved yet."""
+        """Return the agent's hello, before its proof is checked."""
         yield from self._when_ready(self.sock.do_handshake)
         yield from self._write(self._ours)
         self._theirs = yield from self._read_exactly(SECRET_SIZE)
@@ -472,7 +478,7 @@ class MasterHandshake(_Handshake):
         return self._words
 
     def believes(self, key: str) -> bool:
-        """Return whether the agent has ``key``; with this key the master proves itself then."""
+        """Tell whether the agent has ``key``.  If so, the master proves itself by this key."""
         proof = self._proof(b"agent", key, self._certificate, self._words)
         if not hmac.compare_digest(proof, self._said):
             return False
@@ -480,12 +486,12 @@ class MasterHandshake(_Handshake):
         return True
 
     def answer(self, greeting: bytes) -> Steps[None]:
-        """Answer an agent that is believed, and prove to be its master."""
+        """Answer an agent whose proof is valid, and prove to be its master."""
         proof = self._proof(b"master", self._key, self._certificate, greeting)
         yield from self._write(_LENGTH.pack(len(greeting)) + greeting + proof)
 
     def disbelieve(self) -> Steps[None]:
-        """Answer one that is not."""
+        """Answer an agent whose proof is not valid."""
         yield from self._write(_LENGTH.pack(0) + bytes(_PROOF_SIZE))
 
 

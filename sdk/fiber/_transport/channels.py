@@ -139,11 +139,13 @@ class SharedCounter(Counter, Protocol):
 
 
 class naming_the_limit:
-    """Context in which "no more descriptors" and "too large" become errors that name the limit, and
-    what to set."""
+    """Context that turns "no more descriptors" and "too large" into errors that name the limit.
 
-    # Not a generator: contextlib leaves frames that translate errors in a cycle, and with them
-    # whatever descriptors the program had on its stack, until some garbage collection.
+    These errors say which setting to raise.
+    """
+
+    # No generator: contextlib leaves the frames of a translated error in a cycle.  They would keep
+    # the descriptors on the program's stack open until a garbage collection.
 
     def __init__(self, doing: str) -> None:
         self._doing = doing
@@ -177,12 +179,12 @@ def connected() -> tuple[Descriptor, Descriptor]:
 
 
 def _block(sock: socket.socket) -> None:
-    if sock.gettimeout() is not None:  # socket.setdefaulttimeout() is for the user's own
+    if sock.gettimeout() is not None:  # socket.setdefaulttimeout() is for the user's sockets
         sock.settimeout(None)
 
 
 class BorrowedSocket(socket.socket):
-    """A packet socket that blocks, over a descriptor of which somebody else is the owner."""
+    """Blocking packet socket over a descriptor that another object owns."""
 
     __slots__ = ()
 
@@ -203,9 +205,9 @@ def _usual_room() -> int:
 
 
 def grow(sock: socket.socket) -> None:
-    """Double the room of a socket that is full; more than once changes nothing.
+    """Double the buffer of a socket that is full.  A second call changes nothing.
 
-    It is done late: a larger buffer takes a larger ballast (``packet.send``).
+    It is done only when needed: a larger buffer takes a larger ballast (``packet.send``).
     """
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _usual_room())  # the kernel doubles it
 
@@ -213,23 +215,23 @@ def grow(sock: socket.socket) -> None:
 # How a receiver looks for an answer before it sleeps (decision 4)
 
 _LOOK = 200e-6
-"""Seconds that it looks: more than it takes to wake a processor on which the other end sleeps."""
+"""Seconds of looking: longer than it takes to wake the processor of the other end."""
 
 _SOON = 30e-6
-"""Seconds in which the answer has to come, so that looking for the next one is worth it."""
+"""Seconds within which an answer has to come to make it worth looking for the next one."""
 
 _TRIES = 8
-"""Answers in a row that may come later than that, while the other end wakes up."""
+"""Number of answers in a row that may come later, while the other end wakes up."""
 
 _SLEEPS = 255
-"""Answers for which it sleeps at once after looking was not worth it."""
+"""Number of answers for which the receiver sleeps at once, after looking was not worth it."""
 
 _last_asked = 0
-"""The id of the channel on which this process sent last."""
+"""Id of the channel on which this process sent last."""
 
 
 class UnixChannel:
-    """A ``SOCK_SEQPACKET`` socket whose messages are packets."""
+    """Channel over a ``SOCK_SEQPACKET`` socket; its messages are packets."""
 
     __slots__ = ("_owner", "_sleeps", "_sock", "_tries")
 
@@ -241,7 +243,7 @@ class UnixChannel:
 
     @classmethod
     def pair(cls) -> tuple[Self, Self]:
-        """Two connected ends."""
+        """Return two connected ends."""
         one, other = connected()
         return cls(one), cls(other)
 
@@ -252,16 +254,16 @@ class UnixChannel:
 
     @property
     def sock(self) -> socket.socket:
-        """The socket itself, for event loops."""
+        """Socket of the channel, for event loops."""
         return self._sock
 
     @property
     def owner(self) -> Descriptor:
-        """The socket's descriptor, for another channel over the same socket."""
+        """Owner of the socket's descriptor, for another channel over the same socket."""
         return self._owner
 
     def send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
-        """Send one message, waiting for room; a bulky one until it is read."""
+        """Send one message.  Wait for room; after a bulky message, wait until it is read."""
         global _last_asked
         _last_asked = id(self)
         try:
@@ -276,18 +278,18 @@ class UnixChannel:
     send_unconfirmed = send
 
     def recv(self, *, passing: bool = False) -> Message:
-        """The next message, ConnectionClosed at the end."""
+        """Return the next message; ConnectionClosed at the end."""
         return packet.receive(self._sock, passing=passing)
 
     def recv_object(self) -> Any:
-        """The next message, unpickled; ConnectionClosed at the end."""
+        """Return the next message, unpickled; ConnectionClosed at the end."""
         message = self._looked_for()
         if message is None:
             return packet.receive_object(self._sock)
         return packet.loads(message)
 
     def recv_answer(self) -> Message:
-        """Receive as ``recv`` does, a message that is probably there soon."""
+        """Receive a message that probably comes soon, as ``recv`` does."""
         message = self._looked_for()
         return packet.receive(self._sock) if message is None else message
 
@@ -299,7 +301,7 @@ class UnixChannel:
         return None
 
     def _look(self) -> Message | None:
-        """Return the answer if it comes soon."""
+        """Return the answer if it comes soon, else None."""
         begin = time.perf_counter()
         while (message := self.try_recv()) is None:
             if time.perf_counter() - begin > _LOOK:
@@ -324,7 +326,7 @@ class UnixChannel:
         return wait_readable(self._sock.fileno(), timeout)
 
     def fileno(self) -> int:
-        """The socket's descriptor."""
+        """Return the socket's descriptor."""
         return self._sock.fileno()
 
     def close(self) -> None:
@@ -337,7 +339,7 @@ _COUNTER = os.EFD_CLOEXEC | os.EFD_NONBLOCK | os.EFD_SEMAPHORE
 
 
 class UnixCounter:
-    """An eventfd in semaphore mode."""
+    """Counter over an eventfd in semaphore mode."""
 
     __slots__ = ("_fd", "_owner")
 
@@ -347,7 +349,7 @@ class UnixCounter:
 
     @classmethod
     def create(cls, value: int = 0) -> Self:
-        """A counter that starts at ``value``."""
+        """Return a new counter that starts at ``value``."""
         with naming_the_limit("making a counter"):
             return cls(opened(os.eventfd, value, _COUNTER))
 
@@ -375,14 +377,14 @@ class UnixCounter:
                 wait_readable(self._fd, left)
 
     def clear(self) -> int:
-        """Set the count to zero and say what it was."""
+        """Set the count to zero and return the count before."""
         taken = 0
         while self.take(0):
             taken += 1
         return taken
 
     def value(self) -> int:
-        """The count now, as the kernel shows it."""
+        """Return the count, as the kernel shows it."""
         with open(f"/proc/self/fdinfo/{self._fd}", "rb") as info:
             for line in info:
                 if line.startswith(b"eventfd-count:"):
@@ -394,7 +396,7 @@ class UnixCounter:
         return wait_readable(self._fd, timeout)
 
     def fileno(self) -> int:
-        """The eventfd: readable while the count is above zero."""
+        """Return the eventfd, which is readable while the count is above zero."""
         return self._fd
 
     def close(self) -> None:
@@ -404,14 +406,14 @@ class UnixCounter:
 
 
 def wait_until(fd: int, events: int) -> None:
-    """Wait for one of ``events``, or for the end of ``fd``."""
+    """Wait for one of ``events`` of ``fd``, or for its end."""
     poller = select.poll()
     poller.register(fd, events)
     poller.poll()
 
 
 def wait_readable(fd: int, timeout: float | None) -> bool:
-    """Wait until ``fd`` is readable (or at its end); False when ``timeout`` seconds are over."""
+    """Wait until ``fd`` is readable or at its end; return False after ``timeout`` seconds."""
     if fd < 0:
         raise OSError("handle is closed")
     poller = select.poll()
@@ -424,15 +426,15 @@ def wait_readable(fd: int, timeout: float | None) -> bool:
 
 
 _PAUSE = 0.05
-"""Seconds before a message that the system refused is tried again."""
+"""Seconds until a message that the system refused is tried again."""
 
 _Waiting = tuple[BytesLike, Sequence[memoryview], tuple[int, ...]]
 
 
 class Outbox:
-    """The sending side of a non-blocking socket that the loop already reads.
+    """Sending side of a non-blocking socket that the loop already reads.
 
-    On the loop's thread only.
+    Runs on the loop's thread.
     """
 
     def __init__(self, loop: Loop, sock: socket.socket) -> None:
@@ -447,7 +449,7 @@ class Outbox:
     ) -> bool:
         """Send now or as soon as there is room, in order; False if this outbox is closed.
 
-        Takes over ``fds``.  A peer that is gone swallows it.
+        Takes over ``fds``.  If the peer has ended, the message is lost without an error.
         """
         if self._closed:
             _close_all(fds)
@@ -465,13 +467,13 @@ class Outbox:
         return True
 
     def recall(self) -> list[BytesLike]:
-        """Take back the payloads that never left."""
+        """Take back the payloads that have not left."""
         payloads = [payload for payload, _, _ in self._waiting]
         self._drop()
         return payloads
 
     def close(self) -> None:
-        """Send nothing more.  On the loop's thread, before the socket is closed."""
+        """Drop all messages that have not left.  Call it before the socket is closed."""
         self._closed = True
         self._drop()
 
@@ -486,7 +488,7 @@ class Outbox:
         except BlockingIOError:
             return False
         except BrokenPipeError:
-            # The peer is gone; whoever watches it will say so.
+            # The peer has ended; the reader of the socket reports that.
             pass
         _close_all(fds)
         return True
@@ -497,8 +499,8 @@ class Outbox:
                 if not self._try(*self._waiting[0]):
                     return
             except OSError:
-                # No descriptor or no memory.  Its sender cannot be told any more, and others'
-                # ends give back what is missing.
+                # No descriptor or no memory is free.  The sender has gone on, so try again later,
+                # when other processes may have freed some.
                 self._watch(None)
                 self._loop.call_later(_PAUSE, self._watch, self._flush)
                 if self._stalled:

@@ -1,8 +1,8 @@
 """An agent's end of its link to the master.
 
 A master may have several addresses, for instance of both IP families.  The attempts begin a quarter
-of a second apart and run at the same time, and the first that is answered counts (RFC 8305, Happy
-Eyeballs). An address of a family without a route costs no wait.
+of a second apart and run at the same time.  The first that succeeds is used (RFC 8305, Happy
+Eyeballs).  An address of a family without a route costs no wait.
 """
 
 from __future__ import annotations
@@ -38,33 +38,34 @@ from fiber._wire.messages import ProtocolError
 from fiber.errors import AuthenticationError, FiberError, LinkError
 
 _PAUSE_MIN, _PAUSE_MAX = 0.1, 0.3
-"""Seconds from one attempt to dial to the next, growing: a thousand agents that wait for a master
-must neither flood its network nor keep it waiting."""
+"""Seconds between attempts to dial; they grow.  A thousand agents that wait for a master must
+neither flood its network nor keep it waiting."""
 
 _CONNECT = 1.0
-"""Seconds for a connection to be taken.  The kernel would then ask again (RFC 6298), more and more
-seldom, and always where a Service led when it asked first: to a pod that is gone, say."""
+"""Seconds for a connection to be made.  Later the kernel would repeat its request (RFC 6298) at
+growing intervals, and always to the pod that a Service chose at first, which may have ended."""
 
 _GREET = 15.0
-"""Seconds from there to the welcome and the end of TLS.  A thousand agents may dial one master at
-the same time, each of which costs it milliseconds; but its host may vanish in the middle and say no
-more."""
+"""Seconds from the connection to the welcome and the end of TLS.  A thousand agents may dial one
+master at the same time, and each costs it milliseconds.  The limit is for a host that vanishes in
+the middle."""
 
 _LONGER = 2
 """Factor by which an agent waits longer in silence than its master does."""
 
 
 class MasterUnreachable(Exception):
-    """No master took the connection, or it ended before the welcome."""
+    """Error: no master accepted the connection, or it ended before the welcome."""
 
 
 class AgentDialer:
-    """An agent's end: dials the master at ``host:port`` until it answers or ``timeout`` is over
-    (None: for as long as it takes).  A master with several addresses has commas between them.
+    """Agent's end of the link: dials the master until it answers or ``timeout`` seconds are over.
 
-    Calls back once, on the loop's thread: ``on_link`` with the link, or ``on_failed`` with an
-    AuthenticationError, VersionMismatch or LinkError.  A link that breaks later is dialled again
-    until it is lost.  ``connect`` makes the connection, if that is not done by dialling.
+    ``address`` is ``host:port``, with commas between several addresses.  With ``timeout`` None the
+    dialer never gives up.  It calls back once, on the loop's thread: ``on_link`` with the link, or
+    ``on_failed`` with an AuthenticationError, VersionMismatch or LinkError.  If the connection
+    breaks later, it dials again until the link is lost.  ``connect`` replaces the function that
+    makes a connection.
     """
 
     def __init__(
@@ -91,7 +92,7 @@ class AgentDialer:
         self._connect = connect or _connect
         self._name = secrets.token_hex(16)
         self._link: Link | None = None
-        self._obstacle = "nothing was tried"
+        self._obstacle = "no attempt was made"
         self.epoch = credentials.epoch
         """Epoch of the master, once there is a link."""
         self.lost_grace: float | None = None
@@ -104,22 +105,22 @@ class AgentDialer:
         self._start()
 
     def close(self) -> None:
-        """Stop dialling, or drop the link without a farewell.  No callback follows."""
+        """Stop dialling, or drop the link without closing it in order.  No callback follows."""
         self._loop.call_soon(self._stop)
 
     def _start(self, pause: float = 0.0) -> None:
         if self._over.is_set():
             return
         link = self._link
-        welcomed, arrived = (link.heard, link.arrived) if link else (False, 0)
+        welcomed, arrived = (link.has_received, link.arrived) if link else (False, 0)
         hello = AgentHello(self._identity, self._name, arrived, welcomed).encode()
-        # Names are resolved and connections made by calls that block, so they get a thread.
+        # The calls that resolve names and connect block, so they run on a thread.
         dial = threading.Thread(
             target=self._dial, args=(hello, pause), name="fiber-dial", daemon=True
         )
         try:
             dial.start()
-        except RuntimeError as error:  # the system has no thread to give, which may pass
+        except RuntimeError as error:  # the system has no thread left; try again later
             self._obstacle = str(error)
             self._loop.call_later(_PAUSE_MAX, self._start)
 
@@ -148,12 +149,12 @@ class AgentDialer:
             pause = min(max(2 * pause, _PAUSE_MIN), _PAUSE_MAX)
 
     def _pause(self, since: float, seconds: float) -> bool:
-        """Let so much time pass since then, more or less; whether all is over meanwhile."""
+        """Wait until about ``seconds`` after ``since``; return True if dialling was stopped."""
         until = since + seconds * random.uniform(0.5, 1.0)
         return self._over.wait(max(until - time.monotonic(), 0.0))
 
     def _meet(self, hello: bytes) -> tuple[bytes, int, Secrets]:
-        """The master's answer, and the connection without TLS."""
+        """Connect and exchange greetings; return the answer and the connection without TLS."""
         sock = self._connect(self._address)
         tls_handshake = authentication.AgentHandshake(sock, self._context)
         try:
@@ -175,16 +176,16 @@ class AgentDialer:
         steps: authentication.Steps[authentication._T],
         deadline: float,
     ) -> authentication._T:
-        """Take the steps, waiting before each until it can be taken."""
+        """Take the steps, and wait before each until it is possible."""
         poller = select.poll()
         try:
             while not self._over.is_set():
                 poller.register(tls_handshake.sock, next(steps))
                 if not poller.poll(max(deadline - time.monotonic(), 0.0) * 1000):
-                    raise MasterUnreachable("it took the connection and said nothing")
+                    raise MasterUnreachable("it took the connection and sent nothing")
         except StopIteration as finished:
             return finished.value  # type: ignore[no-any-return]  # typeshed cannot know
-        raise MasterUnreachable("it was given up")
+        raise MasterUnreachable("dialling was stopped")
 
     # On the loop's thread
 
@@ -212,9 +213,9 @@ class AgentDialer:
         if isinstance(greeting, MasterWelcome):
             if greeting.epoch < self.epoch:
                 raise LinkError(
-                    f"the master at {self._address} is that of epoch {greeting.epoch}, and this "
-                    f"agent has served the one of epoch {self.epoch} since: another program has "
-                    "taken the pool. End the earlier one"
+                    f"the master at {self._address} has epoch {greeting.epoch}, and this agent has "
+                    f"served a later one, of epoch {self.epoch}: another program has taken the "
+                    "pool. End the earlier program"
                 )
             return greeting
         reason = greeting.reason if isinstance(greeting, MasterRefusal) else "it is an agent itself"
@@ -223,7 +224,7 @@ class AgentDialer:
     def _welcomed(self, welcome: MasterWelcome, descriptor: int, secrets: Secrets) -> None:
         link = self._link
         if link is None:
-            # An agent answers at all times; user code in the master may hold the interpreter long.
+            # An agent answers soon.  User code in the master may hold the interpreter for long.
             lost_after = _LONGER * welcome.lost_after
             keepalive = Keepalive(welcome.heartbeat, welcome.suspect_after, lost_after)
             link = Link(self._loop, welcome.identity, keepalive, lambda _: self._stop(), dials=True)
@@ -232,7 +233,7 @@ class AgentDialer:
                 self._loop, descriptor, secrets, on_datagram=link.datagram, on_gone=self._gone
             )
         except FiberError as error:
-            # No descriptors, which may pass.
+            # No descriptors are free; try again later.
             self._obstacle = str(error)
             self._start(_PAUSE_MAX)
             return
@@ -285,7 +286,7 @@ class AgentDialer:
         self._over.set()
         self._cancel_deadline()
         with self._lock, contextlib.suppress(OSError):
-            if self._sock is not None:  # wakes the thread that waits for it
+            if self._sock is not None:  # wakes the dialling thread
                 socket.socket.shutdown(self._sock, socket.SHUT_RDWR)
         if self._link is not None:
             self._link.disconnect()
@@ -296,7 +297,7 @@ class AgentDialer:
 
 
 def _connect(address: str) -> socket.socket:
-    """A connection; MasterUnreachable, soon, if none can be made at this moment."""
+    """Return a connection; MasterUnreachable, soon, if none can be made now."""
     try:
         sock = connect(parse_addresses(address), _CONNECT)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -305,7 +306,7 @@ def _connect(address: str) -> socket.socket:
     except OSError as error:
         raise MasterUnreachable(str(error.strerror or error).lower()) from error
     except UnicodeError as error:
-        raise MasterUnreachable(f"its name is none: {error}") from error
+        raise MasterUnreachable(f"its name is malformed: {error}") from error
     return sock
 
 
@@ -321,7 +322,7 @@ class _Target(NamedTuple):
 def connect(addresses: Sequence[tuple[str, int]], patience: float) -> socket.socket:
     """Connect to the first of ``addresses`` that answers, each within ``patience`` seconds.
 
-    TimeoutError if some have not answered; else the first OSError or UnicodeError of one.
+    TimeoutError if an address has not answered; otherwise the first OSError or UnicodeError.
     """
     failures: list[OSError | UnicodeError] = []
     targets = _resolve(addresses, failures)
@@ -373,7 +374,7 @@ def _resolve(
 
 
 def _begin(target: _Target) -> socket.socket:
-    """Begin to connect, without waiting for the answer."""
+    """Begin to connect, without waiting for an answer."""
     sock = socket.socket(target.family, socket.SOCK_STREAM)
     try:
         sock.setblocking(False)

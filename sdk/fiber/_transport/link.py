@@ -1,12 +1,12 @@
-"""Interface of a link between the master and an agent.
+"""Link between the master and an agent.
 
-A link carries frames both ways, each once and in order, also when the connection under it breaks
-and is replaced.  It ends when one side closes it, or after too long a silence, and stays ended.
-``Link`` is the implementation: a stream, the loop that drives it, and the present
-connection. Its ``send``, ``close`` and ``attach`` may be called from any thread; they only leave a
-note for the loop. Everything else runs on the loop thread.  The transport under the link
-(``listener``, ``dialer``, ``memory``) calls ``connected``, ``disconnected``, ``datagram`` and
-``refused``.  The link calls ``on_end`` when the transport must forget it.
+A link carries frames in both directions, each once and in order, also when its connection breaks
+and is replaced.  It ends when one side closes it or is silent for too long, and stays ended.
+
+A ``Link`` has a ``LinkProtocol``, the loop that drives it, and the present connection.  Any thread
+may call ``send``, ``close`` and ``attach``; they only leave a note for the loop.  All other methods
+run on the loop thread.  ``MasterListener`` and ``AgentDialer`` call ``connected``,
+``disconnected``, ``datagram`` and ``refused``.  The link calls ``on_end`` when they must forget it.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ class Keepalive(NamedTuple):
     """Limits of silence on a link, in seconds."""
 
     heartbeat: float = HEARTBEAT
-    """A side that has sent nothing for so long sends a heartbeat."""
+    """Seconds without sending after which a side sends a heartbeat."""
     suspect_after: float = 7.0
-    """The peer is suspect: two heartbeats did not come."""
+    """Seconds after which a silent peer is suspect: two heartbeats did not come."""
     lost_after: float = 15.0
-    """The link ends.  Messages that come later are dropped."""
+    """Seconds after which the link to a silent peer ends.  Later messages are dropped."""
 
 
 DEFAULT_KEEPALIVE = Keepalive()
@@ -57,20 +57,23 @@ class LinkObserver(Protocol):
         """Note that the peer has been silent for a while.  It may come back."""
 
     def on_trusted(self) -> None:
-        """Note that a suspect peer is heard again, and nothing was lost."""
+        """Note that a suspect peer has sent something again.  No frame was lost."""
 
     def on_lost(self, reason: str) -> None:
-        """Note that the link ended, and not by ``close`` on this side.  Called once, and last."""
+        """Note that the link ended without ``close`` on this side.  Called once, as the last."""
 
 
 class LinkConnection(Protocol):
-    """Connection under a link.  It keeps the order of datagrams until it breaks."""
+    """Connection of a link.  It keeps the order of datagrams until it breaks.
+
+    ``SealedConnection`` implements it over nng.  The simulation of links has another.
+    """
 
     def put(self, datagram: Datagram) -> None:
         """Send a datagram; never blocks and never raises."""
 
     def break_off(self) -> None:
-        """End the connection as if it had broken, so that the agent dials again."""
+        """Close the connection as if it had broken, so that the agent dials again."""
 
     def close(self) -> None:
         """Close the connection."""
@@ -79,11 +82,11 @@ class LinkConnection(Protocol):
 _CLOSE, _CLOSE_ACK = b"\x20", b"\x21"
 
 _LAST_WORD = 0.2
-"""Seconds for a farewell, or the answer to it, to leave before this side hangs up."""
+"""Seconds for the last datagram to leave before this side closes the connection."""
 
 
 _GRAIN = 0.001
-"""Seconds that a timer takes at least.  Rounding could make a shorter one fire early for ever."""
+"""Least seconds of a timer.  Rounding could make a shorter one fire too early for ever."""
 
 
 class _LinkState(enum.Enum):
@@ -91,12 +94,12 @@ class _LinkState(enum.Enum):
     CLOSING = enum.auto()
     """Closed by this side.  Queued frames still leave."""
     LEAVING = enum.auto()
-    """Waiting for the answer to the good-bye of this side."""
+    """State after this side announced its end: it waits for the answer."""
     ENDED = enum.auto()
 
 
 class Link:
-    """Link over one connection after the other; a ``Link``."""
+    """End of a link.  It uses one connection after the other."""
 
     def __init__(
         self,
@@ -107,7 +110,10 @@ class Link:
         *,
         dials: bool = False,
     ) -> None:
-        """``dials``: True if this side makes new connections, and so may give one up."""
+        """Make a link without a connection.
+
+        ``dials``: True if this side makes new connections, and so may give one up.
+        """
         self.peer = peer
         self._loop = loop
         self._keepalive = keepalive
@@ -128,7 +134,7 @@ class Link:
 
     @property
     def arrived(self) -> int:
-        """Number of the peer's datagrams that have arrived, for the handshake."""
+        """Number of the peer's datagrams that have arrived, for the greeting."""
         return self._protocol.arrived
 
     @property
@@ -137,9 +143,9 @@ class Link:
         return self._connection is not None
 
     @property
-    def heard(self) -> bool:
-        """True if the peer has ever sent anything."""
-        return self._protocol.heard
+    def has_received(self) -> bool:
+        """True if the peer has ever sent a datagram."""
+        return self._protocol.has_received
 
     def attach(self, observer: LinkObserver) -> None:
         """Set the observer.  Frames that arrived before wait for it."""
@@ -149,7 +155,13 @@ class Link:
     def send(
         self, *frame: BytesLike, lane: Lane = None, on_left: Callable[[], None] | None = None
     ) -> None:
-        """Send a frame as soon as there is room; dropped if the link has ended."""
+        """Send a frame as soon as there is room; drop it if the link has ended.
+
+        The frame may be given in pieces.  Large pieces are not copied, and must not change until
+        they have arrived.  Large frames of different lanes travel at the same time
+        (``link_protocol`` has the order).  ``on_left`` is called on the loop's thread when the
+        connection has taken the last piece.
+        """
         self._loop.call_soon(self._send, frame, lane, on_left)
 
     def close(
@@ -159,7 +171,11 @@ class Link:
         linger: float = 1.0,
         then: Callable[[], None] | None = None,
     ) -> None:
-        """End the link after what was sent, within ``linger`` seconds, and then call ``then``."""
+        """End the link.  The peer's observer gets ``on_lost(reason)``; this side's gets no call.
+
+        Frames that were sent still arrive if that takes at most ``linger`` seconds.  ``then`` is
+        called on the loop's thread when the link has ended.
+        """
         self._observer = None
         self._loop.call_soon(self._close, reason, linger, then)
 
@@ -168,7 +184,7 @@ class Link:
         return self._protocol.statistics()
 
     def connected(self, connection: LinkConnection, arrived: int) -> None:
-        """Go on over ``connection``, whose other end has ``arrived`` of our datagrams."""
+        """Go on over ``connection``.  Its other end has ``arrived`` datagrams of this side."""
         if self._state is _LinkState.ENDED:
             connection.close()
             return
@@ -177,7 +193,7 @@ class Link:
         try:
             self._protocol.connected(arrived)
         except ProtocolError as error:
-            # A peer that forgot what it had acknowledged is not the one that this link was with.
+            # A peer that forgot what it acknowledged is not the peer of this link.
             connection.close()
             self._lose(str(error))
             return
@@ -186,7 +202,7 @@ class Link:
         self._flush()
 
     def disconnect(self) -> None:
-        """Close the connection.  The peer has closed it, or dials again once it notices."""
+        """Close the connection.  A peer that dials makes a new one when it notices."""
         if self._connection is not None:
             self._unplug().close()
 
@@ -213,7 +229,7 @@ class Link:
             self._take(connection, datagram)
 
     def refused(self, reason: str) -> None:
-        """End the link, which the peer does not continue."""
+        """End the link, as the peer refuses to continue it."""
         self._lose(reason)
 
     def _take(self, connection: LinkConnection, datagram: BytesLike) -> None:
@@ -224,19 +240,19 @@ class Link:
             connection.break_off()
             return
         except ProtocolError as error:
-            # Past this point nothing that it says can be relied upon.
+            # From here on its datagrams cannot be relied upon.
             self._lose(f"it broke the protocol: {error}")
             return
         if self._state is _LinkState.OPEN:
             self._inbox += frames
-        self._heard()
+        self._trust_peer()
         self._hand_over()
         if self._state is not _LinkState.OPEN or self._protocol.wants_to_speak(now):
             self._flush_soon()
         elif not self._flush_due:
             self._set_timer(now)
 
-    def _heard(self) -> None:
+    def _trust_peer(self) -> None:
         if self._suspect:
             self._suspect = False
             if observer := self._observer:
@@ -262,8 +278,8 @@ class Link:
         self, frame: Sequence[BytesLike], lane: Lane, on_left: Callable[[], None] | None
     ) -> None:
         if self._state is not _LinkState.ENDED:
-            told = None if on_left is None else partial(self._loop.call_soon, on_left)
-            self._protocol.send(*frame, lane=lane, on_left=told)
+            callback = None if on_left is None else partial(self._loop.call_soon, on_left)
+            self._protocol.send(*frame, lane=lane, on_left=callback)
             self._flush_soon()
 
     def _flush_soon(self) -> None:
@@ -288,7 +304,7 @@ class Link:
         self._set_timer(now)
 
     def _set_timer(self, now: float) -> None:
-        """Set the timer.  A timer that fires too early only looks again."""
+        """Set the timer.  A timer that fires too early does no harm."""
         due = self._protocol.next_timer()
         if self._timer is not None:
             if self._timer_due <= due:

@@ -1,36 +1,36 @@
-"""Stream of frames, each once and in order, over one connection after the other.
+"""Protocol of a link: frames, each once and in order, over one connection after the other.
 
-A connection keeps the order and loses nothing until it breaks.  Then the datagrams under way may
-have arrived or not.  The stream makes up for that, and notices a silent peer.  It is pure: the
+A connection keeps the order of datagrams and loses none until it breaks.  Then datagrams on the way
+may have arrived or not.  The protocol repeats them, and notices a silent peer.  It is pure: the
 caller passes the time and carries the datagrams::
 
     send(frame) ─► queue ─► outgoing(now) ─► [datagram] ─────► received(datagram, now) ─► [frame]
                                ▲    │ unacknowledged                          │
                                └────┴──────────── acknowledgement ◄───────────┘
 
-* Datagrams with frames are numbered from 1; every datagram carries the number up to which
-  everything arrived.  The next number is taken, an older one is a repetition.  A newer one means
-  that the connection lost something, as none should: ``Gap``.
-* What is not acknowledged is kept, and sent again on the next connection: both sides then say how
-  far they got.  It is at most WINDOW datagrams and WINDOW_BYTES, so a peer that is slow, or a
-  connection that stands still, costs no more memory than that; what waits travels together.
-* Acknowledgements ride on what is sent anyway, within ACK_DELAY or a quarter of the window.
+* Datagrams with frames have numbers from 1.  Every datagram also carries the number up to which all
+  datagrams of the peer have arrived.  A receiver takes the next number.  A lower number is a
+  repetition.  A higher one means that the connection lost a datagram: ``Gap``.
+* The sender keeps datagrams until they are acknowledged, and repeats them on the next connection,
+  where both sides first say how far they got.  It keeps at most WINDOW datagrams and WINDOW_BYTES.
+  So a slow peer costs no more memory than that, and waiting frames travel together.
+* Acknowledgements travel with other datagrams, within ACK_DELAY or a quarter of the window.
 
-A frame that does not fit into a datagram goes in pieces.  Frames of different lanes take turns, a
-piece at a time, so that a large frame never keeps others waiting for more than a piece::
+A frame that does not fit into a datagram travels in pieces.  Frames of different lanes take turns,
+piece by piece, so a large frame keeps others waiting for one piece at most::
 
     small frames, and all without a lane   ──► first ─┐
     lane 1: large, small, large            ──► turn ──┼─► datagram
     lane 2: large                          ──► turn ──┘
 
-* The frames of one lane keep their order.
-* A frame never arrives before a frame without a lane that was sent earlier.
-* A frame that travels in pieces occupies one of SLOTS slots.  So the receiver puts no more frames
-  than that together at a time.
+* Frames of one lane keep their order.
+* A frame never arrives before an earlier frame that has no lane.
+* A frame that travels in pieces occupies one of SLOTS slots.  So the receiver assembles at most
+  SLOTS frames at a time.
 
-An entry of a datagram is a word and so many bytes.  The word, 32 bits: length:24, slot:6, whether
-it is the frame's first piece, whether it is the last.  A first piece that is not the last begins
-with the frame's size:u64.
+An entry of a datagram is a word and some bytes.  The word has 32 bits: length:24, slot:6, one for
+the first piece of a frame, one for the last.  A first piece that is not the last begins with the
+frame's size:u64.
 
 Layout (little endian): kind:u8, pad:u24, count:u32, number:u64, acknowledged:u64, then a word:u32
 for each of ``count`` entries, and their bytes.
@@ -60,7 +60,7 @@ Pieces: TypeAlias = Sequence[BytesLike]
 
 
 class FramePiece(NamedTuple):
-    """A frame, or a piece of one, in a datagram."""
+    """Frame, or a piece of one, in a datagram."""
 
     word: int
     pieces: Pieces
@@ -68,7 +68,7 @@ class FramePiece(NamedTuple):
 
 
 class _Waiting:
-    """Frame, or the part of it that has not left."""
+    """Frame that waits, or the part of it that has not left."""
 
     __slots__ = ("after", "left", "on_left", "pieces", "size", "slot")
 
@@ -78,19 +78,19 @@ class _Waiting:
         self.on_left = on_left
         self.slot: int | None = None
         self.after = 0
-        """Number of frames of the first queue that go before this one."""
+        """Number of frames of the first queue that leave before this one."""
 
 
 class SendQueue:
-    """Frames that wait.  ``budget``: bytes of a datagram's entries, with their words."""
+    """Frames that wait to be sent.  ``budget``: limit of the bytes of a datagram's entries."""
 
     def __init__(self, budget: int) -> None:
         self._budget = budget
         self._first: deque[_Waiting] = deque()
         self._lanes: dict[Lane, deque[_Waiting]] = {}
-        """Each begins with a large frame.  In the order of their turns."""
+        """Lanes in the order of their turns.  Each begins with a large frame."""
         self._added = self._gone = 0
-        """Frames that have ever entered and left the first queue."""
+        """Numbers of frames that have entered and left the first queue."""
         self._slots = list(range(SLOTS))
         self.bytes = 0
 
@@ -101,7 +101,7 @@ class SendQueue:
         return bool(self._first or self._lanes)
 
     def add(self, frame: Pieces, lane: Lane, on_left: Callable[[], None] | None) -> None:
-        """Queue a frame; ``on_left`` is called when the last of it goes into a datagram."""
+        """Queue a frame; call ``on_left`` when its last piece goes into a datagram."""
         waiting = _Waiting(frame, on_left)
         self.bytes += waiting.size
         if self._lanes and lane in self._lanes:
@@ -119,9 +119,9 @@ class SendQueue:
         self.bytes = 0
 
     def take(self) -> list[FramePiece]:
-        """Take out what goes into the next datagram."""
+        """Remove and return the entries of the next datagram."""
         entries: list[FramePiece] = []
-        # Large frames go on, however many small ones come.
+        # Half of the datagram is for large frames, so that many small ones do not stop them.
         room = self._fill(entries, self._budget, self._budget // 2 if self._lanes else 0)
         while self._lanes and (not entries or room >= self._budget // 4):
             lane = self._next_lane()
@@ -141,7 +141,7 @@ class SendQueue:
         self._added += 1
 
     def _fill(self, entries: list[FramePiece], room: int, reserved: int) -> int:
-        """Take from the first queue while more than ``reserved`` bytes of room are left."""
+        """Take frames of the first queue while more than ``reserved`` bytes of room are left."""
         first = self._first
         while first and room > reserved:
             waiting = first[0]
@@ -201,7 +201,7 @@ class SendQueue:
         return room - size
 
     def _next_of(self, lane: Lane) -> None:
-        """The large frame at the head of a lane has left."""
+        """Go on in a lane whose large frame at the head has left."""
         waiting_in_lane = self._lanes[lane]
         waiting_in_lane.popleft()
         while waiting_in_lane and self._is_small(waiting_in_lane[0]):
@@ -213,7 +213,7 @@ class SendQueue:
 
 
 def _split(frame: Pieces, room: int) -> tuple[Pieces, Pieces]:
-    """Split a frame into as much as there is room for, and the rest."""
+    """Split a frame into the part that fits into ``room``, and the rest."""
     for index, piece in enumerate(frame):
         if len(piece) > room:
             view = memoryview(piece)
@@ -229,19 +229,19 @@ Datagram: TypeAlias = bytes | tuple[BytesLike, ...]
 
 WINDOW = 256
 WINDOW_BYTES = 4 << 20
-"""Limits of datagrams, and of their bytes, that are sent and not acknowledged."""
+"""Limits of datagrams, and of their bytes, that are sent and not acknowledged yet."""
 
 LARGE = 1 << 14
-"""Bytes from which on a piece of a frame is not copied.  The stream keeps it until it arrived."""
+"""Bytes from which a piece of a frame is not copied, but kept until it has arrived."""
 
 BUDGET = 512 * 1024
-"""Bytes of entries in a datagram.  One datagram is sealed while the one before it is sent."""
+"""Limit of the bytes of a datagram's entries.  A datagram is sealed while the last one is sent."""
 
 ACK_DELAY = 0.02
 """Seconds that an acknowledgement may wait for a datagram to go with."""
 
 HEARTBEAT = 3.0
-"""Seconds without sending after which a stream sends a sign of life."""
+"""Seconds without sending after which a side sends a heartbeat."""
 
 DATA, CONTROL = 1, 2
 
@@ -252,11 +252,11 @@ LARGEST = _HEADER.size + BUDGET
 
 
 class Gap(ProtocolError):
-    """The connection has lost a datagram, and must be given up."""
+    """Error: the connection has lost a datagram and must be closed."""
 
 
 class LinkStatistics(NamedTuple):
-    """Counts of what a stream holds now, and of what it has done so far."""
+    """Counts of the frames and bytes that a link holds, and of its work so far."""
 
     queued_frames: int
     queued_bytes: int
@@ -276,7 +276,7 @@ class LinkStatistics(NamedTuple):
 
 
 class LinkProtocol:
-    """End of a stream.  It begins without a connection."""
+    """Protocol at one end of a link.  It begins without a connection."""
 
     def __init__(
         self,
@@ -317,21 +317,21 @@ class LinkProtocol:
 
     @property
     def arrived(self) -> int:
-        """Number of the last datagram taken.  The peer needs it to resume."""
+        """Number of the last datagram that was taken.  The peer needs it to resume."""
         return self._received
 
     @property
-    def heard(self) -> bool:
-        """True if the peer has ever sent anything."""
+    def has_received(self) -> bool:
+        """True if the peer has ever sent a datagram."""
         return bool(self._counts["datagrams_received"])
 
     def send(
         self, *frame: BytesLike, lane: Lane = None, on_left: Callable[[], None] | None = None
     ) -> None:
-        """Queue a frame, in pieces; the next ``outgoing`` takes it along if there is room.
+        """Queue a frame, in pieces; the next ``outgoing`` contains it if there is room.
 
-        ``on_left`` is called when the last of it goes out for the first time.  No piece may change
-        until it has left, nor one from LARGE bytes on until ``idle``.
+        ``on_left`` is called when its last piece leaves for the first time.  A piece must not
+        change until it has left; a piece of LARGE bytes or more must not change until ``idle``.
         """
         self._queue.add(frame, lane, on_left)
         self._counts["frames_sent"] += 1
@@ -346,16 +346,16 @@ class LinkProtocol:
         self._connected = True
         self._acknowledge(arrived)
         self._repeat = bool(self._unacknowledged)
-        self._speak_now = True  # a connection alone says nothing: what comes over it does
+        self._speak_now = True  # the peer trusts a connection only after a datagram
 
     def disconnected(self) -> None:
-        """Note that the connection broke.  Datagrams under way count as not arrived."""
+        """Note that the connection broke.  Datagrams on the way count as not arrived."""
         self._connected = False
         self._ack_due = None
         self._counts["breaks"] += 1
 
     def end(self) -> None:
-        """Forget the frames that have not arrived on either side."""
+        """Forget the frames of both sides that have not arrived."""
         self._queue.clear()
         self._unacknowledged.clear()
         self._unacknowledged_bytes = 0
@@ -375,7 +375,7 @@ class LinkProtocol:
             datagrams.append(self._pack())
         if len(datagrams) > fresh:
             self._answered()
-        elif self._must_speak(now):  # a repetition carries the acknowledgement of its day
+        elif self._must_speak(now):  # a repetition carries an old acknowledgement
             datagrams.append(_HEADER.pack(CONTROL, 0, self._sent, self._received))
             self._answered()
         if datagrams:
@@ -420,17 +420,17 @@ class LinkProtocol:
         return self._take(datagram, count, now)
 
     def tick(self, now: float) -> float:
-        """Return the seconds of the peer's silence, without the time when this process was stopped.
+        """Return the seconds of the peer's silence.
 
-        Call it at ``next_timer``.  A stopped process must not take its own sleep for a silence of
-        its peer.
+        Call it at ``next_timer``.  The time during which this process was stopped does not count:
+        it says nothing about the peer.
         """
         self._silent += min(now - self._ticked, 2 * self._tick)
         self._ticked = now
         return self._silent
 
     def next_timer(self) -> float:
-        """Return when to call ``tick`` and ``outgoing`` again, if nothing happens before."""
+        """Return when to call ``tick`` and ``outgoing`` if no event comes before."""
         due = self._ticked + self._tick
         if self._connected:
             due = min(due, self._last_sent + self._heartbeat)
@@ -439,7 +439,7 @@ class LinkProtocol:
         return due
 
     def statistics(self) -> LinkStatistics:
-        """Return what the stream holds now, and what it has done so far."""
+        """Return the counts of this end."""
         return LinkStatistics(
             queued_frames=len(self._queue),
             queued_bytes=self._queue.bytes,

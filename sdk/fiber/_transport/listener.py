@@ -1,4 +1,4 @@
-"""The master's end of the links of a pool's agents."""
+"""Master's end of the links to a pool's agents."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from fiber.errors import FiberError
 
 
 class MasterListener:
-    """The master's end of the links of a pool's agents.
+    """Master's end of the links to a pool's agents.
 
-    ``at`` is the acceptor that the agents dial, which other pools may share, or an address for an
-    acceptor of this pool's own, which is closed with the pool.  An address is ``host:port``.  The
+    ``at`` is the acceptor that the agents dial, which other pools may share.  Or it is an address
+    for a new acceptor, which is closed with the pool.  An address is ``host:port``.  The
     callbacks run on the loop's thread:
 
     * ``on_agent`` attaches an observer to the new link, or returns why the link is not wanted.
-    * ``on_refused`` gets the line to log for a connection that was turned away.
+    * ``on_refused`` gets the text to log for a connection that was turned away.
     * ``on_proven`` is called for each connection that proved to be an agent of the pool.
     * ``on_unserved`` gets the name of an agent for which this master lacks memory or descriptors,
       and why.
@@ -61,7 +61,7 @@ class MasterListener:
         self._on_unserved = on_unserved
         self._knows = objection
         self.epoch = 0
-        """Number of this master among those of the pool.  On the loop's thread."""
+        """Number of this master among the masters of the pool.  Used on the loop's thread."""
         self._waiting: dict[tuple[str, str], tuple[PendingConnection, AgentHello]] = {}
         self._by_peer: dict[tuple[str, str], Link] = {}
         self._keepalive = keepalive
@@ -92,7 +92,7 @@ class MasterListener:
     ) -> None:
         """Close every link as ``Link.close`` does, then call ``then``.
 
-        Agents that come meanwhile, and later to a shared acceptor, are refused.
+        Agents that dial meanwhile, or later at a shared acceptor, are refused.
         """
         self._loop.call_soon(self._close, reason, linger, then)
 
@@ -120,7 +120,7 @@ class MasterListener:
             self._acceptor.close()
 
     def break_connections(self) -> None:
-        """Break all connections, so that each agent dials again.  On the loop's thread.
+        """Break all connections, so that each agent dials again.  Runs on the loop's thread.
 
         An agent that reaches this master again continues its link, and loses nothing.
         """
@@ -128,7 +128,7 @@ class MasterListener:
             link.disconnect()
 
     def look_again(self) -> None:
-        """Decide anew about the agents that wait.  On the loop's thread."""
+        """Decide again about the agents that wait.  Runs on the loop's thread."""
         waiting, self._waiting = self._waiting, {}
         for pending, hello in waiting.values():
             if not pending.gone:
@@ -164,7 +164,7 @@ class MasterListener:
         if hello.welcomed and hello.link not in self._links:
             return (
                 f"the link of {hello.identity.name!r} is not known here: this master began "
-                "after it, or had given that agent up as lost"
+                "after it, or has given that agent up as lost"
             )
         if (link := self._links.get(hello.link)) is not None:
             if _peer(link.peer) == _peer(hello.identity):
@@ -183,7 +183,7 @@ class MasterListener:
     def _welcome(self, pending: PendingConnection, hello: AgentHello) -> None:
         link = self._links.get(hello.link)
         if link is not None:
-            # The welcome says how much has arrived.  The old connection must bring nothing more.
+            # The welcome says how much has arrived, so the old connection must bring no more.
             link.disconnect()
         arrived = link.arrived if link else 0
         welcome = MasterWelcome(

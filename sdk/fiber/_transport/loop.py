@@ -26,18 +26,24 @@ from fiber.errors import FiberError
 Callback = Callable[[], object]
 
 LONGEST_POLL = 60.0
-"""Seconds that one wait in the kernel lasts at most: it takes no more than 2**31 milliseconds, and
-would never end by itself if somebody closed the descriptors.
+"""Limit of the seconds of one wait in the kernel.
+
+The kernel takes at most 2**31 milliseconds.  If the program closed the descriptors, a longer wait
+would not end by itself.
 """
 
 DOZE = 0.2
-"""Seconds that a wait for the loop, on another thread, lasts at most at a time: so long a signal
-may be slept over that comes just before the sleep (``fiber._runtime.threads`` says why).
+"""Limit of the seconds for which another thread waits for the loop at a time.
+
+A signal that comes just before the wait may wait so long for its handler
+(``fiber._runtime.threads`` says why).
 """
 
 _EVENTS = 128
-"""Descriptors that one turn looks at.  Of more, the kernel shows the others first the next time; in
-between timers are served, and what other threads ask for.
+"""Limit of the descriptors in one turn.
+
+If more are ready, the kernel returns the others in the next turn.  In between the loop serves
+timers and the calls of other threads.
 """
 
 _MANY_TIMERS = 1024
@@ -51,10 +57,10 @@ def runs_here() -> bool:
 
 
 class Dependent(Protocol):
-    """Waiter for something that only a loop can bring."""
+    """Object that waits for something that only a loop can bring."""
 
     def broken(self, error: FiberError) -> None:
-        """Note that the loop has failed and brings nothing.  Called once, on the loop's thread."""
+        """Note that the loop has failed.  Called once, on the loop's thread."""
 
 
 class ScheduledCall(Protocol):
@@ -65,7 +71,10 @@ class ScheduledCall(Protocol):
 
 
 class EventLoop(Protocol):
-    """Part of the loop that a link needs: its clock and its turns."""
+    """Part of a loop that links and backends use: its clock and its calls.
+
+    ``Loop`` implements it.  Tests implement it with simulated time.
+    """
 
     def now(self) -> float:
         """Return the time in seconds of a monotonic clock."""
@@ -110,8 +119,8 @@ class Wakeup:
 class Loop:
     """Event loop over epoll.  ``register`` and ``unregister`` may be called from any thread.
 
-    ``call_soon`` may be called from anywhere: from another thread, from a signal handler, from a
-    finalizer that the garbage collector runs at any line, also of this module.  It takes no lock,
+    ``call_soon`` may be called from anywhere: from another thread, from a signal handler, or from a
+    finalizer, which the garbage collector may run in the middle of this module.  It takes no lock,
     and each of its changes is a single step.
     """
 
@@ -155,11 +164,11 @@ class Loop:
         return self._running
 
     def depend(self, dependent: Dependent) -> None:
-        """Tell ``dependent`` if the loop fails; raise at once if it has failed already.
+        """Call ``dependent.broken`` if the loop fails; raise at once if it has failed already.
 
         The loop holds ``dependent`` weakly.
         """
-        # Both sides note first and look then: one of both sees the other.
+        # Both sides first write and then read, so at least one of them sees the other.
         self._dependents.add(dependent)
         if self._failure is not None:
             raise fresh(self._failure)
@@ -174,7 +183,7 @@ class Loop:
         self._ready.append((callback, args))
         # The loop notes that it goes to sleep, and then looks for calls.  Only the loop takes that
         # note back, so a caller that a signal interrupts here has changed nothing.
-        wakeup = self._wakeup  # held, so that its descriptor is not closed and reused meanwhile
+        wakeup = self._wakeup  # keeps its descriptor from being closed and reused
         if self._asleep and wakeup is not None:
             wakeup.set()
 
@@ -193,14 +202,14 @@ class Loop:
         self._epoll.register(fd, select.EPOLLIN)
 
     def unregister(self, fd: int) -> None:
-        """Forget ``fd``; do it before the descriptor is closed."""
+        """Forget ``fd``.  Call it before the descriptor is closed."""
         self._writers.pop(fd, None)
         self._paused.discard(fd)
         if self._readers.pop(fd, None) is not None and not self._closed:
             self._epoll.unregister(fd)
 
     def pause(self, fd: int) -> None:
-        """Do not call back for what can be read from the registered ``fd``, until resumed."""
+        """Do not call back when the registered ``fd`` is readable, until ``resume``."""
         self._paused.add(fd)
         self._epoll.modify(fd, self._interest(fd))
 
@@ -224,7 +233,7 @@ class Loop:
             self._epoll.modify(fd, self._interest(fd))
 
     def run(self) -> None:
-        """Call back until stopped."""
+        """Run callbacks until ``stop``."""
         self._ident = threading.get_ident()
         self._running = _this_thread.runs_a_loop = True
         try:
@@ -249,28 +258,28 @@ class Loop:
             return
         finally:
             self._asleep = False
-        self._run_ready()  # calls that were asked for before an event run before its callback
+        self._run_ready()  # calls that were requested before an event run before its callback
         self._dispatch(events)
         self._run_ready()
         self._run_timers()
 
     def _break(self, error: BaseException) -> None:
-        """Tell all dependents that nothing will come, so that none waits for ever."""
+        """Call ``broken`` of all dependents, so that none waits for ever."""
         failure = FiberError(
-            f"the thread that Fiber waits with has ended by {error!r}: what was asked for cannot "
-            "arrive. Look whether the program closes descriptors that are not its own, as "
-            "os.closerange() does, and start it again"
+            f"the thread of Fiber's event loop has ended by {error!r}: no answer can arrive. Check "
+            "whether the program closes descriptors that it did not open, as os.closerange() "
+            "does, and start it again"
         )
         failure.__cause__ = error
         self._running = False
         self._failure = failure
         for dependent in list(self._dependents):
             _call(dependent.broken, failure)
-        with contextlib.suppress(OSError):  # the descriptors may be what it failed for
+        with contextlib.suppress(OSError):  # closed descriptors may be the reason for the failure
             self._close()
 
     def stop(self) -> None:
-        """End the loop after what it is doing; from another thread, wait until it has ended."""
+        """End the loop after the present callbacks; from another thread, wait for its end."""
         if self._closed:
             return
         if self._ident is None and (self._thread is None or self._thread.ident is None):
@@ -318,7 +327,7 @@ class Loop:
 
     def _add_timer(self, timer: LoopTimer) -> None:
         if len(self._timers) >= self._sweep_at:
-            # Those that were cancelled long before their time would pile up.
+            # Cancelled timers that are due late would pile up.
             self._timers = [entry for entry in self._timers if entry[2].callback is not None]
             heapq.heapify(self._timers)
             self._sweep_at = max(_MANY_TIMERS, 2 * len(self._timers))
@@ -336,5 +345,5 @@ def _call(callback: Callable[..., object], *args: Any) -> None:
     try:
         callback(*args)
     except Exception:
-        # One broken callback must not stop the others, nor go unseen.
+        # An error in one callback must be reported and must not stop the others.
         report_uncaught()

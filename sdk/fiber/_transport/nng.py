@@ -1,19 +1,21 @@
-"""Connections between two sides that have proved themselves, over nng.  The only importer of pynng.
+"""Sealed connections over nng, between two sides that have proved themselves.
 
-Each connection is a Pair1 socket, made of a descriptor (nng's transport ``socket://``).  Acceptor
-and dialer have made the descriptor and checked the peer.  Here every message is sealed.
+This is the only module that imports pynng.  Each connection is a Pair1 socket, made of a descriptor
+(nng's transport ``socket://``).  Acceptor and dialer have made the descriptor and checked the peer.
+Here every message is sealed.
 
-Facts about nng, and what follows from them:
+Facts about nng, and their consequences:
 
 * nng queues messages that the connection does not take yet, up to the size of its queue.  A link
-  never has that many under way.
-* nng reports the beginning and the end of a connection on its own thread.  These callbacks only
+  never has so many on the way.
+* nng reports the beginning and the end of a connection on a thread of nng.  These callbacks only
   leave a note for the loop.
-* Closed while it still exchanges its greeting (eight bytes each way), it may forget to close the
-  descriptor.  So such a connection is ended first, which nng notices in a moment, and then closed.
-* A socket does not survive a fork: in the child it is made harmless, not closed.
-* pynng copies a message twice on its way; here it is sealed right into nng's memory, and opened
-  right out of it.
+* If a connection is closed while nng still exchanges its greeting (eight bytes in each direction),
+  nng may not close the descriptor.  So such a connection is first shut down, which nng notices in a
+  moment, and then closed.
+* An nng socket does not survive a fork.  The child must not touch it, and does not close it.
+* pynng copies a message twice.  Here a message is sealed into nng's memory, and opened from there,
+  without these copies.
 
 Messages are sealed by AES-256-GCM under a counter, with one key for each direction.  The counter is
 not sent: both sides count.  A message that was changed, repeated or moved on the way does not open,
@@ -54,18 +56,18 @@ OVERHEAD = 16
 
 MESSAGES_PER_KEY = 1 << 20
 BYTES_PER_KEY = 1 << 36
-"""Well below what GCM bears: TLS 1.3 stops at about 2**38 bytes (RFC 8446, 5.5)."""
+"""Bytes well below the limit of GCM: TLS 1.3 stops at about 2**38 (RFC 8446, 5.5)."""
 
 _NONCE = 12
 
 _TURN = 64
-"""Messages taken in one turn of the loop.  Then other descriptors get their turn."""
+"""Limit of the messages read in one turn of the loop.  Then other descriptors get their turn."""
 
 _LARGEST = LARGEST + OVERHEAD + 4
-"""Bytes of the longest message: with a datagram goes nng's own hop count."""
+"""Bytes of the longest message.  nng adds a hop count to a datagram."""
 
 _QUEUE = 2 * WINDOW
-"""Messages that nng keeps for the connection: a link's window, and its acknowledgements."""
+"""Limit of the messages that nng queues: a link's window, and its acknowledgements."""
 
 _NOTICES = 1.0
 """Seconds for nng to notice the end of a connection; it takes a fraction of a millisecond."""
@@ -198,10 +200,10 @@ class SealedConnection:
         loop.register(self._fd, self._readable)
 
     def put(self, datagram: Datagram) -> None:
-        """Send it, sealed; one that cannot be queued breaks the connection."""
+        """Seal and send a datagram.  If nng cannot queue it, the connection breaks."""
         if self._closed:
             return
-        # Pieces are put together at the last moment: in memory that the one before has just left.
+        # Join the pieces late, in memory that the datagram before has just left.
         data = datagram if isinstance(datagram, bytes) else b"".join(datagram)
         size = len(data) + OVERHEAD
         message = self._message
@@ -215,13 +217,13 @@ class SealedConnection:
             self.break_off()
 
     def break_off(self) -> None:
-        """End the connection, and tell as if it had broken."""
+        """Close the connection, and call ``on_gone`` as if it had broken."""
         if not self._closed:
             self.close()
             self._loop.call_soon(self._on_gone, self)
 
     def close(self) -> None:
-        """Hang up."""
+        """Close the connection."""
         if not self._closed:
             self._closed = True
             self._loop.unregister(self._fd)
@@ -230,9 +232,9 @@ class SealedConnection:
             self._socket.close()
 
     def abandon_after_fork(self) -> None:
-        """Let the parent keep what both share; nng aborts a child that touches it."""
+        """Do not touch the socket in a forked child: nng would abort the child."""
         self._closed = True
-        # pynng closes what this attribute holds, when told to and at garbage collection.
+        # pynng closes the object in this attribute at ``close`` and at garbage collection.
         vars(self._socket).pop("_socket", None)
 
     def _came(self) -> None:
@@ -241,18 +243,18 @@ class SealedConnection:
             self._greeting = None
 
     def _end_greeting(self, ours: socket.socket) -> None:
-        """Have nng give up a connection that it has not made a pipe of, and see it let go."""
-        with contextlib.suppress(OSError):  # it is broken already
+        """Shut down a connection whose greeting nng still exchanges; wait until nng closes it."""
+        with contextlib.suppress(OSError):  # it has broken already
             ours.shutdown(socket.SHUT_RDWR)
         connection = os.fstat(ours.fileno()).st_ino
         ours.close()
         until = time.monotonic() + _NOTICES
-        with contextlib.suppress(OSError):  # which says that it is closed
+        with contextlib.suppress(OSError):  # an error means that it is closed
             while os.fstat(self._descriptor).st_ino == connection and time.monotonic() < until:
                 time.sleep(0.0005)
 
     def _went(self) -> None:
-        # What it brought before it broke comes first.
+        # First read the messages that came before it broke.
         self._readable()
         self.break_off()
 
@@ -262,12 +264,12 @@ class SealedConnection:
                 return
             message = self._message
             if _lib.nng_recvmsg(self._socket.socket, message, _lib.NNG_FLAG_NONBLOCK):
-                return  # there is none, or the connection is gone, of which another call tells
+                return  # no message; if the connection has ended, ``_went`` follows
             try:
                 datagram = self._open(message[0])
             except ProtocolError:
-                # Somebody on the way changed something.  What was said before it is safe, and what
-                # was said since is said again on the next connection.
+                # The message was changed on the way.  Earlier messages are safe; this one and later
+                # ones are repeated on the next connection.
                 self.break_off()
                 return
             self._on_datagram(self, datagram)
@@ -292,14 +294,15 @@ def _duplicate(descriptor: int) -> socket.socket:
 def _pair(
     descriptor: int, on_here: Callable[[], None], on_gone: Callable[[], None]
 ) -> tuple[Any, int]:
-    """A Pair1 socket whose only pipe is the connection ``descriptor``, and what is readable
-    whenever a message is there.
+    """Return a Pair1 socket over the connection ``descriptor``, and a descriptor to watch.
+
+    The latter is readable whenever there is a message.
     """
     owned = True
     try:
         pair = pynng.Pair1(recv_max_size=_LARGEST, recv_buffer_size=_TURN, send_buffer_size=_QUEUE)
         try:
-            readable: int = pair.recv_fd  # made now: it takes descriptors of its own
+            readable: int = pair.recv_fd  # made now, as it opens more descriptors
             pair.add_post_pipe_connect_cb(lambda _: on_here())
             pair.add_post_pipe_remove_cb(lambda _: on_gone())
             listener = _ffi.new("nng_listener *")
@@ -335,8 +338,8 @@ def _after_fork_in_child() -> None:
 
 os.register_at_fork(after_in_child=_after_fork_in_child)
 
-# pynng ends nng before multiprocessing's exit functions run, which still need our links; and in a
-# forked child it would close the parent's sockets.  A Finalize runs after them, in this process
-# only.
+# pynng ends nng before multiprocessing's exit functions run, which still need the links.  In a
+# forked child it would also close the parent's sockets.  A Finalize runs after these functions, and
+# in this process only.
 atexit.unregister(pynng.nng._pynng_atexit)
 util.Finalize(None, pynng.nng._pynng_atexit, exitpriority=-200)
