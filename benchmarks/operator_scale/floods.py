@@ -78,6 +78,13 @@ def _large(name: str) -> Body:
     return _pool(name, suspend=True, template=template)
 
 
+def _manifold(name: str) -> Body:
+    """Return a pool whose values take 25 times the memory of their JSON."""
+    template = pod_template()
+    template["spec"]["unknown"] = [{}] * 430_000
+    return _pool(name, suspend=True, template=template)
+
+
 def _broken(name: str) -> Body:
     template = pod_template()
     template["spec"]["containers"][0]["volumeMounts"] = [{"name": "lacking", "mountPath": "/data"}]
@@ -120,6 +127,7 @@ def _complain(kube: Kube, namespace: str, number: int) -> None:
 FLOODS = {
     "none": Flood("no flood"),
     "large": _filled("40 pools of 1.3 MB", _large, 40, _annotated),
+    "manifold": _filled("12 pools of 430,000 values", _manifold, 12, _annotated),
     "changed": _filled("200 pools whose spec changes", _pool, 200, _scaled),
     "broken": _filled("100 pools whose template is refused", _broken, 100, _scaled),
     "events": Flood("Warning events of pods", _complain),

@@ -22,6 +22,7 @@ from kubernetes.aio.client.rest import RESTClientObject, RESTResponse
 
 from fiber_api import names
 from fiber_operator.responses import (
+    METADATA,
     METADATA_LIST,
     PIECE,
     Body,
@@ -62,6 +63,7 @@ CONNECT_TIMEOUT = 5.0
 
 _MERGE_PATCH = "application/merge-patch+json"
 _JSON = "application/json"
+_METADATA_OF_ONE = f"{_JSON};as={METADATA};g=meta.k8s.io;v=v1"
 _METADATA = f"{_JSON};as={METADATA_LIST};g=meta.k8s.io;v=v1"
 
 
@@ -126,6 +128,11 @@ class Cluster:
     def check_permit(self) -> None:
         """Raise the error of ``permit`` if this process may change nothing now."""
         self._permit()
+
+    async def read_metadata(self, resource: ResourceType, namespace: str, name: str) -> Body:
+        """The metadata of the object as it is now."""
+        answer = await self._call("get", resource, namespace, name, accept=_METADATA_OF_ONE)
+        return object_of(answer, name, f"get {resource.plural} {name}")
 
     async def read(self, resource: ResourceType, namespace: str, name: str) -> Body:
         """The object as it is now, not as a cache had it."""

@@ -47,6 +47,7 @@ from fiber_operator.responses import (
     Conflict,
     Gone,
     Invalid,
+    Oversized,
     Refused,
     TooMany,
     Unavailable,
@@ -87,6 +88,10 @@ class PoolMemory:
     pace: CreationPace = field(default_factory=CreationPace)
     written: Mapping[str, Any] | None = None
     """Status that the API server returned for the last write; None if that is not known."""
+    oversized: str = ""
+    """Why the operator does not read the spec: it has too many values.  Empty: it does."""
+    told: Mapping[str, Any] = field(default_factory=dict)
+    """Status that was written for a pool that the operator does not read."""
     generation: int = -1
     """Generation of the pool at the last reconcile that did not fail, or the present one."""
 
@@ -208,6 +213,8 @@ class Applier:
         try:
             answer = await self._cluster.patch(POOLS, *work.key, patch, "status")
             work.state.written = mapping(answer, "status")
+        except Oversized:
+            work.state.told = work.plan.status
         except (Refused, Invalid) as error:
             event = PoolEvent("Warning", Reason.FORBIDDEN, messages.unwritable_status(error))
             self._tell(work, [event])
@@ -428,7 +435,7 @@ class Controller:
     async def _read(self, key: Key) -> tuple[Body, PoolMemory] | None:
         """The pool as it is now, and what is remembered of it."""
         try:
-            document = await self._cluster.read(POOLS, *key)
+            document, oversized = await self._document(key)
         except Gone:
             self._drop(key)
             return None
@@ -440,10 +447,23 @@ class Controller:
             state = self._states[key] = PoolMemory(uid)
         # Events about this very spec, our own status among them, are no news while this lasts.
         state.generation = whole(mapping(document, "metadata").get("generation"))
+        state.oversized = oversized
+        if oversized:
+            document = {**document, "status": dict(state.told)}
         return document, state
+
+    async def _document(self, key: Key) -> tuple[Body, str]:
+        """Read the pool.  If it has too many values, return its metadata and what is wrong."""
+        try:
+            return await self._cluster.read(POOLS, *key), ""
+        except Oversized as error:
+            wrong = f"spec: {error.message}, so the operator does not read it"
+        return await self._cluster.read_metadata(POOLS, *key), wrong
 
     async def _pass(self, work: Work) -> Result:
         try:
+            if work.state.oversized:
+                raise InvalidPool((work.state.oversized,))
             work.pool = pool = FiberPool.read(work.document)
         except InvalidPool as error:
             pods = await self._pods(work)

@@ -6,6 +6,7 @@ Each error is one of these classes, by which a caller decides what to do::
     ├── Gone         404  the object does not exist
     ├── Conflict     409  the name is taken, or a precondition does not hold
     ├── Refused      403  quota, policy, or a missing right
+    ├── Oversized         the answer has more values than are decoded
     ├── Invalid      400, 422 and the rest of 4xx: a retry will not help
     └── Unavailable  the outcome is not known: 5xx, no connection, timeout, a garbled answer
         └── TooMany  429  retry after ``retry_after`` seconds
@@ -83,11 +84,20 @@ class TooMany(Unavailable):
         self.retry_after = retry_after
 
 
+class Oversized(ApiError):
+    """The object has so many values that it is not decoded: each takes memory."""
+
+
 def complaint(error: ApiError) -> str:
     """Return what went wrong, and what to do if that is known."""
     if isinstance(error, Refused):
         return f"{error}. Give the operator's account this right: the chart's roles have it"
     return str(error)
+
+
+MOST_VALUES = 50_000
+"""Values of an object that is decoded.  A FiberPool may have a million, which take 25 times the
+memory of their JSON; a long template has some hundred."""
 
 
 def object_of(answer: Body, name: str, what: str) -> Body:
@@ -100,6 +110,9 @@ def object_of(answer: Body, name: str, what: str) -> Body:
 
 def document_of(status: int, headers: Mapping[str, str], data: bytes, what: str) -> Body:
     """The document in an answer; what is no success is raised."""
+    # Each value but the first of its list or object has a comma before it.
+    if data.count(b",") + data.count(b"[") + data.count(b"{") > MOST_VALUES:
+        raise Oversized(f"it has more than {MOST_VALUES} values", what=what, status=status)
     try:
         body = json.loads(data)
     except (ValueError, RecursionError):
@@ -159,7 +172,8 @@ def _excerpt(data: bytes) -> str:
 
 PIECE = 2**16
 """Bytes that are read at least before others may go on: some 16 pods."""
-METADATA_LIST = "PartialObjectMetadataList"
+METADATA = "PartialObjectMetadata"
+METADATA_LIST = f"{METADATA}List"
 
 _SPACE = re.compile(r"[ \t\n\r]*")
 _decode = json.JSONDecoder().raw_decode

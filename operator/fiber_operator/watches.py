@@ -35,6 +35,7 @@ from fiber_operator.lease_monitor import connected_in
 from fiber_operator.logs import about
 from fiber_operator.planning.documents import mapping, text, whole
 from fiber_operator.responses import (
+    METADATA,
     METADATA_LIST,
     PIECE,
     ApiError,
@@ -70,7 +71,7 @@ async def _ask_for_metadata(
 ) -> aiohttp.ClientResponse:
     if request.url.name in {resource.plural for resource in WATCHED}:
         watch = request.url.query.get("watch") == "true"
-        kind = "PartialObjectMetadata" if watch else METADATA_LIST
+        kind = METADATA if watch else METADATA_LIST
         request.headers["Accept"] = f"application/json;as={kind};g=meta.k8s.io;v=v1"
     return await handler(request)
 

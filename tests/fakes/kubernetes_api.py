@@ -189,7 +189,7 @@ class KubernetesApi:
         if call.verb == "list":
             return _list_as_asked(request, self._list(request, call))
         if call.verb == "get":
-            return self.store.get(*where)
+            return _as_asked(request, self.store.get(*where))
         if call.verb == "create":
             if call.plural == "pods" and request.query.get("fieldValidation") == "Strict":
                 strict.check(body)

@@ -13,6 +13,7 @@ from fakes import virtual_time
 from fakes.kubernetes_api import Call
 from fakes.store import Body, Failure
 from fakes.world import NAMESPACE, TEMPLATE, Test, World, a_world
+from fiber_operator import responses
 from unit.operator_objects import MASTER
 
 
@@ -447,6 +448,26 @@ async def test_what_no_event_tells_is_found_within_a_minute(world: World) -> Non
     world.store.delete("fiberpools", NAMESPACE, "second")
     await world.settled(65)
     assert [key.name for key in world.program.queue.known()] == ["es"]
+
+
+@played()
+async def test_a_spec_of_too_many_values_is_not_read_and_the_pool_says_so(world: World) -> None:
+    """A million empty objects fit into a FiberPool and take gigabytes."""
+    world.make_pool(replicas=2)
+    await world.ready(2)
+    spec = {**TEMPLATE["spec"], "x": [{}] * (responses.MOST_VALUES + 1)}
+    world.edit(template={"spec": spec}, replicas=5)
+    await world.until(lambda: "InvalidSpec" in world.reasons())
+    (problem,) = world.status()["problems"]
+    assert f"more than {responses.MOST_VALUES} values" in problem["message"]
+    assert len(world.pods()) == 2
+    await world.settled(600)
+    statuses = world.api.count("patch", "fiberpools")
+    await world.settled(600)
+    assert world.api.count("patch", "fiberpools") == statuses, "it is said once"
+    world.edit(template={"spec": {**TEMPLATE["spec"], "x": None}})
+    await world.ready(5)
+    assert world.reasons() == []
 
 
 @played()
