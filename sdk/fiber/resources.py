@@ -135,7 +135,7 @@ def with_resources(function: _F, wishes: Resources) -> _F:
 
 
 def largest(wishes: Iterable[Resources]) -> Resources:
-    """Return the largest wish for each resource, and the nodes that suit all wishes.
+    """Return the largest wish for each resource, and node labels that satisfy all wishes.
 
     The result has no pool. ValueError if two wish different values of one node label.
     """

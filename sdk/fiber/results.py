@@ -370,17 +370,17 @@ class _ResultBuffer:
 class _OrderedResultBuffer(_ResultBuffer):
     def __init__(self, pool: Keeper) -> None:
         super().__init__(pool)
-        self._early: dict[int, tuple[list[Any], int]] = {}
+        self._out_of_order: dict[int, tuple[list[Any], int]] = {}
 
     def _keep(self, start: int, outcomes: list[Any], size: int) -> None:
         """Pass on the outcomes that are next in order."""
-        self._early[start] = outcomes, size
-        while (ready := self._early.pop(self._passed, None)) is not None:
+        self._out_of_order[start] = outcomes, size
+        while (ready := self._out_of_order.pop(self._passed, None)) is not None:
             self._pass_on(*ready)
 
     def _drop(self) -> None:
         super()._drop()
-        self._early.clear()
+        self._out_of_order.clear()
 
 
 class IMapIterator(Iterator[_T]):
