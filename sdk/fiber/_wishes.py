@@ -63,7 +63,7 @@ def extended_resources(value: object) -> Counts:
         raise ValueError("expected a dict of extended resources, as {'amd.com/gpu': 1}")
     for name in value:
         if name == GPU:
-            raise ValueError(f"{name} is what gpu= counts: use that")
+            raise ValueError(f"{name} is counted by gpu=: use gpu= instead")
         if not isinstance(name, str) or not re.fullmatch(f"{_DOMAIN}/{_NAME}", name):
             raise ValueError(
                 f"{name!r} is no extended resource, as 'amd.com/gpu' is. CPUs and memory are cpu= "

@@ -46,7 +46,7 @@ WAITS: dict[str, Callable[[Pool], Any]] = {
 def test_who_waits_for_the_same_pool_is_refused(ask: Callable[[Pool], Any]) -> None:
     with fiber.Pool(1) as pool:
         found = pool.map_async(abs, [Asking(lambda: ask(pool))])
-        with pytest.raises(RuntimeError, match="cannot wait for the same pool"):
+        with pytest.raises(RuntimeError, match="cannot wait for a result of the same pool"):
             found.get(PATIENCE)
     pool.join()
 

@@ -132,13 +132,13 @@ class UserThreads:
         """Raise RuntimeError where a result would wait for the calling thread."""
         if self.pickling.runs_here():
             raise RuntimeError(
-                "what a pool pickles for its workers cannot wait for the same pool, which would "
-                "wait for the pickle: get the result before the map, or in the task"
+                "code that pickles a task cannot wait for a result of the same pool, which waits "
+                "for the pickle. Get the result before the map, or in the task"
             )
         if self.unpickling.runs_here():
             raise RuntimeError(
-                "what unpickles a result cannot wait for another result of the same executor, "
-                "which would be unpickled later: get that result where this one is used"
+                "code that unpickles a result cannot wait for another result of the same executor, "
+                "which is unpickled later. Get that result where this one is used"
             )
 
 

@@ -52,8 +52,8 @@ class WorkerResources:
         chosen = self._chosen.setdefault("resources", wanted)
         if wishes != Resources() and merged(chosen, wishes) != chosen:
             raise ValueError(
-                f"this pool's workers have {chosen}, and {function!r} wants {wanted}: all workers "
-                "of a pool have what its first task wished. Make another pool for this function."
+                f"this pool's workers have {chosen}, and {function!r} wishes {wanted}. All workers "
+                "of a pool have the resources of its first task. Make another pool for it."
             )
 
 
