@@ -190,8 +190,8 @@ def test_credentials_from_a_file_serve_for_all_its_masters(pool: Pool, tmp_path:
 
 def test_it_serves_where_the_kernel_does_not_hide_it_and_says_so(pool: Pool) -> None:
     refused = """
-    from fiber._agent import leftovers
-    leftovers.hide_this_process = lambda: False
+    from fiber._agent import main as agent_main
+    agent_main.hide_this_process = lambda: False
     """
     agent = pool.agent(30, refused + AGENT)
     assert pool.master().line() == "joined warm-0"
@@ -275,7 +275,7 @@ def test_sigterm_ends_it_while_it_waits(pool: Pool) -> None:
 def test_sigterm_that_another_thread_takes_between_two_lives_ends_it(pool: Pool) -> None:
     told = """
     import os, signal, threading
-    from fiber._agent import leftovers
+    from fiber._agent import main as agent_main
 
     def take() -> None:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGTERM])
@@ -287,7 +287,7 @@ def test_sigterm_that_another_thread_takes_between_two_lives_ends_it(pool: Pool)
         thread.join()
         return True
 
-    leftovers.end = end
+    agent_main.end_descendants = end
     """
     agent = pool.agent(30, told + AGENT)
     master = pool.master()

@@ -6,13 +6,14 @@ import os
 from pathlib import Path
 from typing import Any
 
-from fiber._agent import program_folder
+from fiber._agent.child import ProgramPaths
+from fiber._agent.zygote import unpack
 from fiber._backends.program_files import Entry, select
 from fiber._backends.program_layout import Layout, Places
 from fiber._backends.shipping import pack
 from fiber._wire.memory_files import Blob
 
-NOWHERE = program_folder.ProgramPaths((), (), "", None)
+NOWHERE = ProgramPaths((), (), "", None)
 
 
 def layout(*folders: Path, program: Path | None = None, files: tuple[Path, ...] = ()) -> Layout:
@@ -37,7 +38,7 @@ def packed(*folders: Path, **options: Any) -> bytes:
 def unpacked(archive: bytes, target: Path) -> Path:
     """``target``, with what is in the archive."""
     blob = Blob(archive)  # whose descriptor lives as long as it does
-    program_folder.unpack(blob.fileno(), str(target))
+    unpack(blob.fileno(), str(target))
     return target
 
 

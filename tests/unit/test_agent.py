@@ -18,9 +18,8 @@ import pytest
 import census
 from fiber import reduction
 from fiber._agent import zygote_process
-from fiber._agent.agent import Agent
+from fiber._agent.agent import Agent, LocalChild
 from fiber._agent.interface import ChildSpec
-from fiber._agent.local_child import LocalChild
 from fiber._transport.loop import Loop
 from fiber._wire import descriptor, packet
 from fiber.errors import TooManyOpenFiles

@@ -11,8 +11,8 @@ import pytest
 
 import census
 from fiber._agent.agent import Agent
+from fiber._agent.child import ProgramPaths
 from fiber._agent.interface import Cause
-from fiber._agent.program_folder import ProgramPaths
 from fiber._hub.hub import Hub
 from fiber._transport.loop import Loop
 from fiber._wire.descriptor import contents

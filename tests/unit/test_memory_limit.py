@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from fiber._agent.agent import Agent, MemoryLimit
+from fiber._agent.agent import Agent
+from fiber._agent.last_words import MemoryLimit
 
 
 @pytest.fixture

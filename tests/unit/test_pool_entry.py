@@ -27,7 +27,7 @@ import pytest
 import fiber
 from fiber import pool as pool_module
 from fiber import process
-from fiber._agent import agent, local_child
+from fiber._agent import agent, zygote_link
 from fiber._engine.scheduler import Scheduler
 from fiber._runtime import executor, popen, state, workers
 from fiber._runtime.state import runtime
@@ -411,12 +411,12 @@ def test_a_pool_that_the_collector_finds_while_the_loop_works_for_it_ends(
 STARTING = (
     agent,
     executor,
-    local_child,
     pool_module,
     popen,
     process,
     state,
     workers,
+    zygote_link,
 )
 
 

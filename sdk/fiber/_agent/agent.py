@@ -6,29 +6,38 @@ separate process (``python -m fiber.agent``), whose observers send events over t
 The agent runs on the loop's thread.  Any thread may call ``Agent.child``, which registers nothing,
 and a child's ``recall`` and ``signal``, which only put a call into the loop's queue.  So the agent
 needs no lock, on which a finalizer or a signal handler could block.
-
-``MemoryLimit`` detects children that the kernel killed because the control group was out of memory.
-They look like any other child that got a SIGKILL, so the kernel's count of such deaths decides.
 """
 
 from __future__ import annotations
 
 import itertools
 import os
+import resource
+import select
 import signal
+import socket
+import struct
 import threading
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 from fiber._agent import zygote
+from fiber._agent.child import StartRequest, lineage
 from fiber._agent.interface import Cause, ChildObserver, ChildSpec, ExitReport
-from fiber._agent.last_words import ProgressTable
-from fiber._agent.local_child import LocalChild, ZygoteLink
+from fiber._agent.last_words import MemoryLimit, ProgressTable, describe
 from fiber._agent.preload import Imports
+from fiber._agent.zygote_link import ZygoteLink
+from fiber._agent.zygote_process import is_standard_stream
 from fiber._hub import client as hub_client
 from fiber._hub.hub import Hub
 from fiber._hub.protocol import HubAddress
+from fiber._transport.channels import Outbox, naming_the_limit, socketpair
 from fiber._transport.loop import Loop
-from fiber._wire.memory_files import Blob
+from fiber._wire import packet
+from fiber._wire.memory_files import Blob, BytesLike
+from fiber._wire.packet import Message
+from fiber.errors import TooManyOpenFiles
 
 _ENDING = "this process is ending: no process can be started any more"
 
@@ -114,10 +123,11 @@ class Agent:
         link = self._newest_zygote(program)
         if link is None or link is instead_of:
             link = ZygoteLink(
-                self,
                 self.loop,
                 self.progress_table.fd,
                 self._cleanup_directory,
+                on_reply=self._on_reply,
+                on_exit=self._on_zygote_exit,
                 imports=imports,
                 program=program,
                 folder=None if program is None else self._new_folder(),
@@ -152,7 +162,7 @@ class Agent:
 
     # Messages of zygotes, on the loop's thread
 
-    def on_reply(self, link: ZygoteLink, reply: tuple[Any, ...]) -> None:
+    def _on_reply(self, link: ZygoteLink, reply: tuple[Any, ...]) -> None:
         """Handle a zygote's message about one of this agent's children."""
         child = self._children.get(reply[1])
         if child is None:
@@ -184,7 +194,7 @@ class Agent:
         elif (slot := self._abandoned.pop(reply[1], None)) is not None:
             self.progress_table.release(slot)  # the child can no longer write to the slot
 
-    def on_zygote_exit(self, link: ZygoteLink) -> None:
+    def _on_zygote_exit(self, link: ZygoteLink) -> None:
         """Report the end of all children of a zygote that died; they died with it."""
         if link in self._zygotes:
             self._zygotes.remove(link)
@@ -253,75 +263,284 @@ def _same(one: Blob | None, other: Blob | None) -> bool:
     return one is other or (one is not None and other is not None and one.digest == other.digest)
 
 
-def describe(exitcode: int) -> str:
-    """Return an exit code in words."""
-    if exitcode >= 0:
-        return f"exit status {exitcode}"
-    try:
-        return f"killed by {signal.Signals(-exitcode).name}"
-    except ValueError:
-        return f"killed by signal {-exitcode}"
+_SEQ = struct.Struct("<Q")
+
+_NO_ROOM = (TooManyOpenFiles, MemoryError)
+_LOST = (*_NO_ROOM, ValueError, struct.error)
+"""Errors that lose a packet: it was taken from its socket and cannot be delivered."""
 
 
-_ROOT = "/sys/fs/cgroup"
-_MEMBERSHIP = "/proc/self/cgroup"
+class LocalChild:
+    """A child of this host; a ``ChildHandle``."""
 
-_UNITS = (("Gi", 1 << 30), ("Mi", 1 << 20), ("Ki", 1 << 10))
+    def __init__(self, agent: Agent, id_: int, spec: ChildSpec, observer: ChildObserver) -> None:
+        self.id = id_
+        self.name = spec.name
+        self.host = agent.host
+        self.node = ""
+        self.pid: int | None = None
+        self.waiting = False
+        self.leaving = ""
+        self.slot: int | None = None
+        self.start_error: Exception | None = None
+        self.fault: Exception | None = None
+        self.zygote: ZygoteLink | None = None
+        self.observer = observer
+        self._spec = spec
+        self._agent = agent
+        self._loop = agent.loop
+        self._ours: socket.socket | None = None
+        self._theirs: socket.socket | None = None
+        self._outbox: Outbox | None = None
+        self._lent = False
+
+    def start(self) -> None:
+        """Start the child.  Calls that follow in the same turn of the loop find it registered."""
+        self._agent.start(self)
+
+    def _make_channel(self) -> None:
+        slot = self._agent.progress_table.claim()
+        try:
+            ours, theirs = socketpair("starting a pool worker")
+        except BaseException:
+            self._agent.progress_table.release(slot)
+            raise
+        ours.setblocking(False)
+        self.slot = slot
+        # The agent keeps the child's end too.  From there it takes back packets that the child has
+        # not read, when the child dies or another worker is idle.  The kernel gives each packet to
+        # exactly one reader.
+        self._ours, self._theirs = ours, theirs
+
+    def open(self) -> None:
+        """Make the task channel of a pool worker and begin to receive from it."""
+        if self._spec.tasks:
+            self._make_channel()
+        if self._ours is not None:
+            self._outbox = Outbox(self._loop, self._ours)
+            self._loop.register(self._ours.fileno(), self._receive)
+
+    def fork_from(self, zygote: ZygoteLink, hub: HubAddress | None) -> None:
+        """Have ``zygote`` start the child; ``hub`` is the address of the host's hub."""
+        self.leave_zygote()
+        self.zygote = zygote
+        zygote.children += 1
+        spec = self._spec
+        fds = self._descriptors()
+        request = StartRequest(
+            spec.name,
+            self.host,
+            spec.method,
+            spec.preparation,
+            spec.payload,
+            self.slot,
+            spec.executable,
+            open_files=resource.getrlimit(resource.RLIMIT_NOFILE),
+            hub=hub,
+            ancestors=lineage(),
+            folder=zygote.folder,
+            has_arguments=spec.arguments is not None,
+            payload_at=None if spec.payload_at is None else spec.payload_at[1:],
+        )
+        zygote.start(self.id, request, fds)
+
+    def leave_zygote(self) -> None:
+        """Stop counting the child among those of its zygote: it is gone, or gets another one."""
+        if self.zygote is not None:
+            self.zygote.children -= 1
+
+    def _descriptors(self) -> list[int]:
+        """Return new descriptors for the child: stdout, stderr, task channel, arguments, a large
+        payload, and those of its handles.
+        """
+        ours = [] if self._theirs is None else [self._theirs.fileno()]
+        if self._spec.arguments is not None:
+            ours.append(self._spec.arguments.fileno())
+        if self._spec.payload_at is not None:
+            ours.append(self._spec.payload_at[0].fileno())
+        fds: list[int] = []
+        try:
+            with naming_the_limit("starting a process"):
+                if self._spec.stdio is None:
+                    fds += map(_dup_or_null, (1, 2))
+                handed = [owner.fileno() for owner in self._spec.fds]
+                fds += map(os.dup, [*(self._spec.stdio or ()), *ours, *handed])
+        except BaseException:
+            zygote.close_all(fds)
+            raise
+        return fds
+
+    @property
+    def tasks(self) -> bool:
+        """True for a pool worker."""
+        return self._spec.tasks
+
+    @property
+    def program(self) -> Blob | None:
+        """Files of the program that the child needs; None once the child is started."""
+        return self._spec.program
+
+    def release_descriptors(self) -> None:
+        """Close the agent's copies of the child's handles, and free its payload.
+
+        Otherwise the other end would not see EOF when the child closes its own copies.
+        """
+        self._spec.close()
+        self._spec = replace(
+            self._spec, payload=b"", payload_at=None, fds=(), program=None, arguments=None
+        )
+
+    def deliver(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
+        """Send a packet to the worker; return False if the worker is gone."""
+        outbox = self._outbox
+        return outbox is not None and outbox.send(b"".join((_SEQ.pack(seq), payload)), buffers)
+
+    def lend(self) -> LocalTaskChannel | None:
+        """Return the channel for direct use; None if there is none, or no descriptor is left."""
+        if self._ours is None or self._ours.fileno() < 0:
+            return None
+        try:
+            # A duplicate, since the kernel may reuse the number of a closed descriptor while the
+            # user of the channel waits on it.
+            fd = os.dup(self._ours.fileno())
+        except OSError:
+            return None
+        self._loop.pause(self._ours.fileno())
+        self._lent = True
+        sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET, fileno=fd)
+        return LocalTaskChannel(sock, self.abort)
+
+    def reclaim(self) -> None:
+        """Receive the child's packets again, after ``lend``."""
+        self._lent = False
+        self.resume()
+
+    def pause(self) -> None:
+        """Receive no packets until ``resume``; the child blocks once the socket is full."""
+        if self._ours is not None and self._ours.fileno() >= 0:
+            self._loop.pause(self._ours.fileno())
+
+    def resume(self) -> None:
+        """Receive the child's packets again, after ``pause``."""
+        if self._ours is not None and self._ours.fileno() >= 0:
+            self._loop.resume(self._ours.fileno())
+
+    def recall(self) -> None:
+        """Take back unread packets; ``observer.recalled`` gets the answer on the loop's thread."""
+        self._loop.call_soon(self._send_recalled)
+
+    def signal(self, signum: int) -> None:
+        """Signal the child through its zygote."""
+        if self._loop.broken:
+            self._signal(signum)  # the loop runs no calls
+        else:
+            self._loop.call_soon(self._signal, signum)
+
+    def _signal(self, signum: int) -> None:
+        if self.zygote is not None:
+            self.zygote.send(zygote.SIGNAL, self.id, signum)
+        if signum == signal.SIGKILL and self.pid is None:
+            self._agent.abandon(self)
+
+    def abort(self, fault: Exception) -> None:
+        """Kill the child because a packet to or from it is lost; its exit report says so."""
+        self.fault = self.fault or fault
+        self.signal(signal.SIGKILL)
+
+    def drain_and_close(self) -> tuple[int, ...]:
+        """Pass on the dead child's last packets, close its channel and return the unread packets.
+
+        Runs on the loop's thread.
+        """
+        self.release_descriptors()
+        if self._ours is None or self._theirs is None:
+            return ()
+        if self._outbox is None:  # the channel was never opened
+            self._ours.close()
+            self._theirs.close()
+            return ()
+        while self._hear():
+            pass
+        unread = self._recall()
+        self._loop.unregister(self._ours.fileno())
+        self._outbox.close()
+        self._ours.close()
+        self._theirs.close()
+        return tuple(unread)
+
+    def _send_recalled(self) -> None:
+        if self._theirs is not None and self._theirs.fileno() >= 0:
+            self.observer.recalled(self._recall())
+
+    def _receive(self) -> None:
+        if not self._lent:  # an event from before ``lend``: its packet is for the channel's user
+            self._hear()
+
+    def _hear(self) -> bool:
+        assert self._ours is not None
+        try:
+            message = packet.receive(self._ours, passing=self._spec.passing)
+        except (BlockingIOError, EOFError):
+            return False
+        except _LOST as error:  # else the master would wait for this packet
+            self.abort(error)
+            return True
+        try:
+            self.observer.received(message)
+        except Exception as error:
+            self.abort(error)
+            raise
+        return True
+
+    def _recall(self) -> list[int]:
+        assert self._theirs is not None
+        assert self._outbox is not None
+        seqs = []
+        while True:
+            try:
+                message = packet.receive(self._theirs, wait=False)
+            except (BlockingIOError, EOFError):
+                break
+            except _NO_ROOM as error:
+                self.abort(error)
+                continue
+            seqs.append(_SEQ.unpack_from(message.payload)[0])
+            message.release()
+        return seqs + [_SEQ.unpack_from(payload)[0] for payload in self._outbox.recall()]
 
 
-class MemoryLimit:
-    """Memory limit of the control group that this process is in."""
+class LocalTaskChannel:
+    """Task channel of a child, for direct use; a ``DirectChannel``."""
 
-    def __init__(self, root: str = _ROOT, membership: str = _MEMBERSHIP) -> None:
-        self._events, self._maximum = _files(root, membership)
-        self._kills = self._count()
+    def __init__(self, sock: socket.socket, abort: Callable[[Exception], None]) -> None:
+        self._sock = sock
+        self._abort = abort
+        self._poller = select.poll()
+        self._poller.register(sock, select.POLLIN)
 
-    def was_exceeded(self) -> bool:
-        """Return whether the kernel has killed a process for memory since the last call."""
-        before, self._kills = self._kills, self._count()
-        return self._kills > before
+    def send(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
+        """Send a packet; raise OSError if that fails."""
+        packet.send(self._sock, b"".join((_SEQ.pack(seq), payload)), buffers)
 
-    def describe(self) -> str:
-        """Return a sentence with the limit as Kubernetes writes it."""
-        limit = _read(self._maximum).strip()
-        if limit.isdigit():
-            return f"its memory limit is {_quantity(int(limit))}"
-        return "no limit of its own"
+    def receive(self, timeout: float) -> Message | None:
+        """Return the next packet, or None after ``timeout`` seconds; raise EOFError at the end."""
+        if not self._poller.poll(timeout * 1000):
+            return None
+        try:
+            return packet.receive(self._sock)
+        except BlockingIOError:  # the agent took the packet, since the child died
+            return None
+        except _NO_ROOM as error:
+            self._abort(error)
+            raise
 
-    def _count(self) -> int:
-        for line in _read(self._events).splitlines():
-            name, _, count = line.partition(" ")
-            if name == "oom_kill" and count.isdigit():
-                return int(count)
-        return 0
+    def close(self) -> None:
+        """Close this channel's descriptor."""
+        self._sock.close()
 
-
-def _files(root: str, membership: str) -> tuple[str, str]:
-    """Return the paths of the file that counts the deaths and the file with the limit."""
-    groups = {}
-    for line in _read(membership).splitlines():
-        _, controllers, group = line.split(":", 2)
-        groups[controllers] = group.rstrip("/")
-    found = []
-    # In a separate cgroup namespace the group is the root of the mount, under any name.
-    for group in (groups.get("", ""), ""):
-        found.append((f"{root}{group}/memory.events", f"{root}{group}/memory.max"))
-    for group in (groups.get("memory", ""), ""):
-        old = f"{root}/memory{group}"
-        found.append((f"{old}/memory.oom_control", f"{old}/memory.limit_in_bytes"))
-    return next((files for files in found if _read(files[0])), found[0])
+    def __del__(self) -> None:
+        self._sock.close()
 
 
-def _quantity(limit: int) -> str:
-    for unit, size in _UNITS:
-        if limit % size == 0:
-            return f"{limit // size}{unit}"
-    return f"{limit} bytes"
-
-
-def _read(path: str) -> str:
-    try:
-        with open(path, encoding="utf-8") as file:
-            return file.read()
-    except OSError:  # no such file, or no such group
-        return ""
+def _dup_or_null(fd: int) -> int:
+    return os.dup(fd) if is_standard_stream(fd) else os.open(os.devnull, os.O_RDWR | os.O_CLOEXEC)

@@ -16,7 +16,7 @@ from multiprocessing import util
 from typing import Any, NamedTuple
 
 from fiber import _logs
-from fiber._agent import last_words, program_folder
+from fiber._agent import last_words
 from fiber._agent.last_words import ProgressTable
 from fiber._agent.zygote_process import interpreter_arguments
 from fiber._hub import client as hub_client
@@ -26,6 +26,9 @@ from fiber._wire.descriptor import Descriptor, contents, own
 
 _LONGEST_LINE = 1 << 16
 """Bytes of one line that are buffered before they are written."""
+
+_INSTALLED = ("site-packages", "dist-packages")
+"""Folders of installed packages."""
 
 _PR_SET_PDEATHSIG = 1
 _PR_SET_CHILD_SUBREAPER = 36
@@ -44,6 +47,19 @@ host = ""
 
 class UnguardedMainError(RuntimeError):
     """Error of a main module that starts a process each time it is imported."""
+
+
+class ProgramPaths(NamedTuple):
+    """Paths of the program's folders and files, relative to the folder that holds them."""
+
+    before_library: tuple[str, ...]
+    """Entries of ``sys.path`` before the standard library, such as a script's folder."""
+    before_installed: tuple[str, ...]
+    """Entries after the standard library; here they come before all installed packages."""
+    directory: str
+    """Working directory."""
+    main: str | None
+    """File of the main module, if children import that by its path."""
 
 
 class StartRequest(NamedTuple):
@@ -227,8 +243,34 @@ def read_preparation(start: StartRequest) -> dict[str, Any]:
     data: dict[str, Any] = pickle.loads(start.preparation)
     data |= {"name": start.name, "host": start.host}
     if start.folder is not None:
-        data |= program_folder.places(data["program"], start.folder)
+        data |= places(data["program"], start.folder)
     return data
+
+
+def places(paths: ProgramPaths, folder: str) -> dict[str, Any]:
+    """Return the entries of a child's preparation that hold paths."""
+
+    def here(names: tuple[str, ...]) -> list[str]:
+        return [os.path.join(folder, name) for name in names]
+
+    library, installed = _own_path(folder)
+    directory = os.path.join(folder, paths.directory)
+    data: dict[str, Any] = {
+        "sys_path": here(paths.before_library) + library + here(paths.before_installed) + installed,
+        "dir": directory,
+        "orig_dir": directory,
+    }
+    if paths.main is not None:
+        data["init_main_from_path"] = os.path.join(folder, paths.main)
+    return data
+
+
+def _own_path(folder: str) -> tuple[list[str], list[str]]:
+    """Return this interpreter's ``sys.path`` in two parts: standard library, installed packages."""
+    own = [path for path in sys.path if path and not path.startswith(folder + os.sep)]
+    names = map(os.path.basename, own)
+    end = next((index for index, name in enumerate(names) if name in _INSTALLED), len(own))
+    return own[:end], own[end:]
 
 
 @contextlib.contextmanager

@@ -1,7 +1,7 @@
 """Interface between the master, which wants children, and the agents, which run them.
 
 The master asks through ``ChildHandle`` and gets answers through ``ChildObserver``.  Both a child of
-this process (``local_child.py``) and one behind a link (``fiber._backends``) have a
+this process (``LocalChild``) and one behind a link (``fiber._backends``) have a
 ``ChildHandle``.
 """
 

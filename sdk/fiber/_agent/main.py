@@ -1,21 +1,26 @@
-"""The life of an agent's process, from its environment to its exit status."""
+"""Process of an agent, from its environment to its exit status.
+
+The agent protects itself from the processes of its tasks, which run as the same user.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
+import importlib.util
 import math
 import os
 import signal
 import socket
 import sys
+import sysconfig
 import time
 from dataclasses import replace
 from multiprocessing import current_process
 from typing import NoReturn
 
 from fiber import _logs, config
-from fiber._agent import leftovers, zygote_process
+from fiber._agent import zygote_process
 from fiber._agent.agent import Agent
 from fiber._agent.child import become_subreaper, go_on_without_parent
 from fiber._agent.service import AgentService
@@ -81,7 +86,7 @@ class Main:
     def __init__(self) -> None:
         self._environment = dict(os.environ)
         # Children run as the same user and must not read the memory of the agent.
-        is_hidden = leftovers.hide_this_process()
+        is_hidden = hide_this_process()
         self._credentials = _read(_required(_CREDENTIALS))  # before any process starts
         self._name = self._credentials.name
         if not is_hidden:
@@ -149,7 +154,7 @@ class Main:
         """End what tasks left behind; return why that failed."""
         if self._service is not None and not self._inherits_orphans:
             return _UNSEEN
-        return None if leftovers.end(_LEFT) else _LEFT_BEHIND
+        return None if end_descendants(_LEFT) else _LEFT_BEHIND
 
     def _hand_on_credentials(self) -> None:
         descriptor = replace(self._credentials, epoch=self._dialer.epoch).to_descriptor()
@@ -178,7 +183,7 @@ class Main:
         _complain(f"fiber agent {self._name}", what)
 
     def _joined(self, link: Link) -> None:
-        leftovers.keep_search_path()  # before the first task
+        keep_search_path()  # before the first task
         self._service = AgentService(self._loop, link, self._agent, self._hub, self._ended)
         self._link = link
         link.attach(self._service)
@@ -272,7 +277,7 @@ def _next_life() -> list[str]:
 
     The environment is for its children.  The agent's own interpreter ignores it.
     """
-    leftovers.keep_search_path()
+    keep_search_path()
     flags = zygote_process.flags()
     statement = (
         f"import sys; sys.path[:] = {sys.path!r}; from fiber._agent import zygote_process; "
@@ -349,6 +354,89 @@ def _complain(who: str, what: object) -> None:
     if (path := os.environ.get(_REPORT)) is not None:
         with contextlib.suppress(OSError), open(path, "w", errors="replace") as file:
             file.write(str(what))
+
+
+# Protection from the processes of tasks, which run as the same user
+
+_PR_SET_DUMPABLE = 4
+
+_DEPENDENCIES = ("cloudpickle", "cryptography", "pynng")
+"""Packages that an agent may import late."""
+
+_PAUSE = 0.01
+"""Seconds between two checks of processes that end."""
+
+
+def hide_this_process() -> bool:
+    """Have the kernel hide memory and descriptors of this process from the user's other processes.
+
+    Return whether the kernel does.  A seccomp profile may refuse it.
+    """
+    refused: int = ctypes.CDLL(None).prctl(_PR_SET_DUMPABLE, 0, 0, 0, 0)
+    return not refused
+
+
+def keep_search_path() -> None:
+    """Restrict ``sys.path`` to places that have modules of this process, Python's own first.
+
+    A task may write a module to the working directory or to a folder of ``PYTHONPATH``.
+    """
+    main = sys.modules["__main__"]  # has a second name, for multiprocessing
+    found = [importlib.util.find_spec(name) for name in _DEPENDENCIES]
+    files = [spec.origin for spec in found if spec is not None]
+    others = [module for module in list(sys.modules.values()) if module is not main]
+    files += [getattr(module, "__file__", None) for module in others]
+    places = list(dict.fromkeys(map(os.path.abspath, sys.path)))
+    used = {_place_of(file, places) for file in files if file is not None}
+    own = [sysconfig.get_path(kind) for kind in ("stdlib", "platstdlib", "purelib", "platlib")]
+    own += [os.path.join(path, "lib-dynload") for path in own]
+    sys.path[:] = sorted(filter(used.__contains__, places), key=lambda place: place not in own)
+
+
+def _place_of(file: str, places: list[str]) -> str:
+    """Return the innermost of the places that the file is in; empty if it is in none."""
+    within = [place for place in places if file.startswith(place.rstrip(os.sep) + os.sep)]
+    return max(within, key=len, default="")
+
+
+def end_descendants(timeout: float) -> bool:
+    """Kill all descendants; return whether none is left after ``timeout`` seconds.
+
+    This process must be a subreaper, or process 1 of its container.  Then orphaned descendants
+    become its children.
+    """
+    deadline = time.monotonic() + timeout
+    while True:
+        for pid in _descendants():
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.kill(pid, signal.SIGKILL)
+        if not _reap():
+            return True
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(_PAUSE)
+
+
+def _reap() -> bool:
+    """Collect children that have ended; return whether there are others."""
+    try:
+        while os.waitpid(-1, os.WNOHANG)[0]:
+            pass
+    except ChildProcessError:
+        return False
+    return True
+
+
+def _descendants() -> list[int]:
+    parents = {}
+    for entry in os.listdir("/proc"):
+        if entry.isdigit():
+            with contextlib.suppress(OSError), open(f"/proc/{entry}/stat", "rb") as file:
+                parents[int(entry)] = int(file.read().rpartition(b")")[2].split()[1])
+    found = [os.getpid()]
+    for pid in found:
+        found += [child for child, parent in parents.items() if parent == pid]
+    return found[1:]
 
 
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_THRESHOLD = -1, -2, -3  # malloc.h

@@ -17,10 +17,9 @@ from functools import partial
 from typing import Any
 
 from fiber import config
-from fiber._agent.agent import Agent
+from fiber._agent.agent import Agent, LocalChild
 from fiber._agent.interface import Cause, ChildSpec, ExitReport
 from fiber._agent.last_words import TELL
-from fiber._agent.local_child import LocalChild
 from fiber._hub.hub import Hub
 from fiber._transport.channels import naming_the_limit
 from fiber._transport.link import Link

@@ -37,15 +37,20 @@ import socket
 import sys
 import time
 import warnings
-from typing import Any, NoReturn
+from collections.abc import Iterable
+from typing import IO, TYPE_CHECKING, Any, NoReturn
 
 from fiber._agent import child as child_module
-from fiber._agent import last_words, program_folder
+from fiber._agent import last_words
 from fiber._agent.child import StartRequest
 from fiber._agent.last_words import ProgressTable
 from fiber._agent.preload import Imports, Unfit, preload
 from fiber._wire import packet
+from fiber._wire.descriptor import contents
 from fiber.errors import TooManyOpenFiles
+
+if TYPE_CHECKING:
+    import tarfile
 
 SETUP, START, SIGNAL, DESCRIPTORS, QUIT = range(5)
 STARTED, FAILED, EXITED, FORK_UNSAFE = range(4)
@@ -150,7 +155,7 @@ class Zygote:
         (owner, fds), self._descriptors = self._descriptors, (0, [])
         if owner == child:
             return fds
-        _close_all(fds)
+        close_all(fds)
         return []
 
     def _start(self, child: int, start: StartRequest, fds: list[int]) -> None:
@@ -158,11 +163,11 @@ class Zygote:
             self._unpack_program()
         except Exception as error:  # the next child may find more room
             self._reply(FAILED, child, f"the program's files could not be unpacked: {error}")
-            _close_all(fds)
+            close_all(fds)
             return
         if start.method == "fork" and not self._is_fork_safe(start):
             self._reply(FORK_UNSAFE, child, self._unfit and self._unfit.safe)
-            _close_all(fds)
+            close_all(fds)
             return
         # The child ignores what the zygote ignores until it resets the handlers.  Blocked, a signal
         # that comes right after the fork waits instead of being lost.
@@ -179,7 +184,7 @@ class Zygote:
             return
         finally:
             signal.pthread_sigmask(signal.SIG_UNBLOCK, _SHUTDOWN_SIGNALS)
-            _close_all(fds)
+            close_all(fds)
         self._pids[child] = pid
         self._children[pid] = child
         if words >= 0:
@@ -189,7 +194,7 @@ class Zygote:
     def _unpack_program(self) -> None:
         if self._program is not None:
             archive, folder = self._program
-            program_folder.unpack(archive, folder)
+            unpack(archive, folder)
             self._program = None
             os.close(archive)
 
@@ -218,7 +223,7 @@ class Zygote:
             self._control.close()
             os.close(self._sigchld)
             os.close(self._sigchld_in)
-            _close_all([*self._ancestors[1:], *self._words.values()])
+            close_all([*self._ancestors[1:], *self._words.values()])
             child_module.die_with_parent(self._pid)
             resource.setrlimit(resource.RLIMIT_NOFILE, start.open_files)
             code = child_module.run(start, fds, self._progress_table, self._ancestors[0], words)
@@ -299,9 +304,63 @@ def _kill(pid: int, signum: int) -> None:
         os.kill(pid, signum)
 
 
-def _close_all(fds: list[int]) -> None:
+def close_all(fds: Iterable[int]) -> None:
+    """Close descriptors."""
     for fd in fds:
         os.close(fd)
+
+
+def unpack(archive: int, folder: str) -> None:
+    """Unpack the file ``archive`` to a new ``folder``: folders, plain files, links within it.
+
+    ValueError: the archive has something else.  After an error there is no folder.
+    """
+    import shutil
+    import tarfile  # needed only if a program was sent
+
+    os.mkdir(folder, 0o700)
+    try:
+        file: Any = contents(archive)
+        with tarfile.open(fileobj=file, mode="r|gz") as members:
+            _extract(members, folder)
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+
+
+def _extract(members: tarfile.TarFile, folder: str) -> None:
+    links = []
+    for member in members:
+        path = os.path.join(folder, _within(member.name, member.name))
+        if member.isdir():
+            os.mkdir(path, 0o700)
+        elif member.isreg():
+            _write(path, members.extractfile(member), executable=bool(member.mode & 0o100))
+        elif member.issym():
+            _within(os.path.join(os.path.dirname(member.name), member.linkname), member.name)
+            links.append((member.linkname, path))
+        else:
+            raise ValueError(f"{member.name!r} is neither a file nor a folder nor a link")
+    # Links come last, so that no file is written through a link.
+    for target, path in links:
+        os.symlink(target, path)
+
+
+def _within(path: str, name: str) -> str:
+    normal = os.path.normpath(path)
+    if os.path.isabs(normal) or normal.split(os.sep)[0] in (os.pardir, os.curdir):
+        raise ValueError(f"{name!r} leads out of the folder")
+    return normal
+
+
+def _write(path: str, source: IO[bytes] | None, *, executable: bool) -> None:
+    import shutil
+
+    assert source is not None
+    with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+        shutil.copyfileobj(source, file)
+        if executable:
+            os.fchmod(file.fileno(), 0o700)
 
 
 def main(control: int, agent: int) -> None:

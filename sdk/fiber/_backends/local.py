@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from fiber._agent.agent import Agent
+from fiber._agent.agent import Agent, LocalChild
 from fiber._agent.interface import ChildHandle, ChildObserver, ChildSpec
-from fiber._agent.local_child import LocalChild
 from fiber._hub.hub import Hub
 from fiber._transport.loop import Loop
 

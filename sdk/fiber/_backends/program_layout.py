@@ -33,7 +33,7 @@ from pathspec import GitIgnoreSpec
 from pathspec.patterns.gitignore import GitIgnorePatternError
 from pathspec.patterns.gitignore.spec import GitIgnoreSpecPattern
 
-from fiber._agent.program_folder import ProgramPaths
+from fiber._agent.child import ProgramPaths
 
 _INSTALLED = frozenset({"site-packages", "dist-packages"})
 

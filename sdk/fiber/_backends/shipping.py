@@ -18,7 +18,7 @@ from collections.abc import Iterable, Mapping
 from itertools import islice
 from typing import Any, NamedTuple
 
-from fiber._agent.program_folder import ProgramPaths
+from fiber._agent.child import ProgramPaths
 from fiber._backends import program_files
 from fiber._backends.program_files import Entry, LeftOut, Why, select
 from fiber._backends.program_layout import INCLUDING, Layout, find_layout, main_file
