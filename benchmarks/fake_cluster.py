@@ -18,9 +18,9 @@ from benchmarks.agent_host import Order
 
 from fiber._agent.interface import ChildObserver, ChildSpec
 from fiber._backends.agent_set import AgentSet
-from fiber._backends.output import Output
 from fiber._backends.remote import RemoteAgent, RemoteChild
 from fiber._engine.placement import Placement
+from fiber._logs import Output
 from fiber._runtime.state import Runtime
 from fiber._transport.credentials import make_credentials
 from fiber._transport.link import Link

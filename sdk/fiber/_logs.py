@@ -1,9 +1,17 @@
-"""The logger ``fiber``, a child of multiprocessing's logger once that exists."""
+"""Text on stderr: the logger ``fiber``, and the output of children on other hosts.
+
+The logger is a child of multiprocessing's logger once that exists.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import io
+import os
+import queue
+import select
 import sys
+import threading
 from multiprocessing import util
 from typing import Any
 
@@ -39,3 +47,117 @@ def show(level: str) -> None:
         util.get_logger().setLevel(level)
     else:
         util.log_to_stderr(level)
+
+
+_ROOM = 4 << 20
+"""Characters that may wait for stderr.  Above that lines are left out, until half of it is free."""
+
+
+_ERASE = "\r\x1b[K"
+"""Takes away what stands in a terminal's last line."""
+
+
+class Output:
+    """Lines on their way to stderr.  One that is slow, stuck or broken holds up nobody: what it
+    has no room for is left out, and how much that was is said in its place.
+    """
+
+    def __init__(self) -> None:
+        self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        self._thread: threading.Thread | None = None
+        self._lock = threading.Lock()
+        self._waiting = 0
+        """Characters in the queue, and those that are being written."""
+        self._left_out = 0
+        """Lines since the last that was taken."""
+        self._line = ""
+        """Line that stands below the output."""
+        self._redraws = False
+        """True if the thread must draw that line anew."""
+
+    def write(self, who: str, text: str) -> None:
+        """Lines of ``who``; returns at once."""
+        self._start()
+        lines = "".join(f"[{who}] {line}\n" for line in text.split("\n"))
+        with self._lock:
+            if self._waiting > (_ROOM // 2 if self._left_out else _ROOM):
+                self._left_out += lines.count("\n")
+            else:
+                self._say_what_is_left_out()
+                self._put(lines)
+
+    def show(self, line: str) -> None:
+        """Have ``line`` stand below all that is written, in place of the one before; returns at
+        once.  For a terminal.
+        """
+        self._start()
+        with self._lock:
+            self._line = line
+            if not self._redraws:
+                self._redraws = True
+                self._lines.put("")
+
+    def close(self) -> None:
+        """Write what is left."""
+        if self._line:
+            self.show("")
+        with self._lock:
+            self._say_what_is_left_out()
+        self._lines.put(None)
+        if self._thread is None:
+            self._run()
+        else:
+            self._thread.join(timeout=2)
+
+    def _start(self) -> None:
+        with self._lock:
+            if self._thread is None:
+                thread = threading.Thread(target=self._run, name="fiber-output", daemon=True)
+                # The system may have no thread to give.  Then the next line starts it, or ``close``
+                # writes the lines.
+                with contextlib.suppress(RuntimeError):
+                    thread.start()
+                    self._thread = thread
+
+    def _say_what_is_left_out(self) -> None:
+        number, self._left_out = self._left_out, 0
+        if number:
+            self._put(
+                f"[fiber] {number} lines are left out here: stderr took them more slowly than they "
+                "came\n"
+            )
+
+    def _put(self, lines: str) -> None:
+        self._waiting += len(lines)
+        self._lines.put(lines)
+
+    def _run(self) -> None:
+        shown = ""
+        while (lines := self._lines.get()) is not None:
+            with self._lock:
+                line, self._redraws = self._line, False
+            # A full disk or a closed terminal must not cost more than the lines.
+            with contextlib.suppress(OSError, ValueError):
+                _write(f"{_ERASE if shown else ''}{lines}{line}")
+            shown = line
+            with self._lock:
+                self._waiting -= len(lines)
+                if not self._waiting:
+                    self._say_what_is_left_out()
+
+
+def _write(text: str) -> None:
+    stream = sys.stderr
+    if not isinstance(stream, io.TextIOWrapper) or stream is not sys.__stderr__:
+        stream.write(text)
+        stream.flush()
+        return
+    # Past its buffer, where another thread's print may have put half of a line.
+    descriptor = stream.fileno()
+    data = text.encode(stream.encoding, stream.errors or "strict")
+    while data:
+        # A pipe keeps together what is written by one call, up to this size.
+        end = data.rfind(b"\n", 0, select.PIPE_BUF) + 1
+        if not end:  # a longer line, or the last one
+            end = data.find(b"\n") + 1 or len(data)
+        data = data[os.write(descriptor, data[:end]) :]

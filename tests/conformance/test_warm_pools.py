@@ -6,8 +6,7 @@ import pytest
 
 from conformance.runner import Target
 from conformance.warm_pools import warm_pools
-from fiber._backends.kubernetes.api import POOLS, Api
-from fiber._backends.kubernetes.api_errors import NotFound
+from fiber._backends.kubernetes.api import POOLS, Api, NotFound
 from fiber._backends.kubernetes.attached_pool import Master
 
 VARIABLES = Target("fiber", "spawn", frozenset({"core"}), 60).variables()

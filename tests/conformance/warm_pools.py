@@ -25,8 +25,7 @@ from typing import Any
 
 from fakes.cluster import FakeCluster, fake_cluster
 from fiber import config
-from fiber._backends.kubernetes.api import POOLS, Api
-from fiber._backends.kubernetes.api_errors import NotFound
+from fiber._backends.kubernetes.api import POOLS, Api, NotFound
 from fiber._backends.kubernetes.template import Shape, fiber_pool_body, pod_template
 from fiber_api import names
 from unit.kubernetes_rig import kubeconfig

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from fiber._backends.kubernetes import program
-from fiber._backends.kubernetes.api_errors import Forbidden
+from fiber._backends.kubernetes.api import Forbidden
 from fiber._backends.kubernetes.program import reachable_address, resolved
 from fiber.errors import ConfigError, FiberPoolError
 

@@ -19,8 +19,12 @@ from kubernetes.config import incluster_config
 from fakes.certificates import RUN_VALIDITY, Certificates, make_certificates
 from fakes.kubernetes_api import Fault
 from fakes.served import Served, served
-from fiber._backends.kubernetes.api import LEASES, NODES, PODS, POOLS, Api
-from fiber._backends.kubernetes.api_errors import (
+from fiber._backends.kubernetes.api import (
+    LEASES,
+    NODES,
+    PODS,
+    POOLS,
+    Api,
     ApiError,
     Conflict,
     Expired,
@@ -33,8 +37,8 @@ from fiber._backends.kubernetes.api_errors import (
     Unauthorized,
     Unreachable,
     error_of,
-    explain,
 )
+from fiber._backends.kubernetes.problems import explain
 from fiber.errors import ConfigError
 from patience import PATIENCE
 from unit.kubernetes_rig import NAMESPACE, kubeconfig

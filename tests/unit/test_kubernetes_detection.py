@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from fiber._backends.kubernetes import backend
-from fiber._backends.kubernetes.api_errors import Forbidden, NotFound, Unreachable
+from fiber._backends.kubernetes.api import Forbidden, NotFound, Unreachable
 from fiber._runtime.state import _is_on_cluster
 from fiber.config import Config
 from fiber.errors import ConfigError

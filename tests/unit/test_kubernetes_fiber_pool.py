@@ -18,7 +18,7 @@ from fakes.kubernetes_api import Call, Fault
 from fakes.rights import FiberUser
 from fakes.store import Failure
 from fiber._backends.kubernetes import fiber_pool, informer
-from fiber._backends.kubernetes.api_errors import Forbidden
+from fiber._backends.kubernetes.api import Forbidden
 from fiber_api import identity, names
 from patience import PATIENCE
 from unit.kubernetes_rig import MASTER, NAMESPACE, OTHER, Body, Rig, Told

@@ -11,7 +11,7 @@ import pytest
 
 from fakes.kubernetes_api import Fault
 from fiber._backends.kubernetes import fiber_pool
-from fiber._backends.kubernetes.api_errors import ApiError
+from fiber._backends.kubernetes.api import ApiError
 from fiber._backends.kubernetes.attached_pool import AttachedPool
 from fiber._backends.kubernetes.fiber_pool import LeaseRenewer
 from fiber.errors import FiberPoolError

@@ -13,7 +13,7 @@ import pytest
 from fiber._agent.interface import Cause, ChildSpec, ExitReport
 from fiber._backends.agent_set import AgentSet
 from fiber._backends.kubernetes import program, waiting
-from fiber._backends.kubernetes.pods import Pods
+from fiber._backends.kubernetes.backend import Pods
 from fiber._backends.kubernetes.program import PreparedPool
 from fiber._backends.kubernetes.template import Shape
 from fiber._backends.remote import RemoteChild

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from fiber._backends.kubernetes.api_errors import Forbidden, ServerError, Unreachable
+from fiber._backends.kubernetes.api import Forbidden, ServerError, Unreachable
 from fiber._backends.kubernetes.problems import PoolName, Reporter
 from fiber.errors import FiberPoolError
 

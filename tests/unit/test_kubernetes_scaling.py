@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from fiber._backends.kubernetes.api_errors import (
+from fiber._backends.kubernetes.api import (
     ApiError,
     Conflict,
     Forbidden,

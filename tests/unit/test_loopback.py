@@ -25,11 +25,11 @@ import fiber
 from fiber import config
 from fiber._agent.interface import ChildSpec
 from fiber._backends import loopback
-from fiber._backends.output import Output
 from fiber._backends.remote import RemoteAgent, RemoteChild
 from fiber._engine import start_failures
 from fiber._engine.start_failures import TRIES
 from fiber._hub.protocol import HubAddress
+from fiber._logs import Output
 from fiber._runtime import state
 from fiber._transport import listener
 from fiber._wire import messages

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 
 from fiber._backends import output
-from fiber._backends.output import Output
+from fiber._logs import Output
 from patience import PATIENCE
 
 SAID = re.compile(r"\[fiber\] (\d+) lines are left out here")

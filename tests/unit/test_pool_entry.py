@@ -422,7 +422,7 @@ STARTING = (
 
 def living() -> list[Any]:
     """The children of this host's agent, which knows all that there are."""
-    return list(runtime().backend._agent._children.values())  # type: ignore[attr-defined]
+    return list(runtime().backend._children.values())  # type: ignore[attr-defined]
 
 
 def at_exit() -> list[Any]:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from fiber._backends import secret_files
+from fiber._backends import program_files
 
 BODY = base64.encodebytes(bytes(range(200))).decode()
 CERTIFICATE = f"-----BEGIN CERTIFICATE-----\n{BODY}-----END CERTIFICATE-----\n"
@@ -21,7 +21,7 @@ def key(kind: str = "") -> str:
 
 def found(path: Path) -> str | None:
     status = path.stat()
-    return secret_files.in_file(str(path), status.st_size, status.st_mtime_ns)
+    return program_files.secret_in_file(str(path), status.st_size, status.st_mtime_ns)
 
 
 @pytest.mark.parametrize(
@@ -114,14 +114,14 @@ def test_names_that_are_none(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.parametrize("name", [".aws", ".envs", ".ssh", ".Kube"])
 def test_folders_of_secrets(name: str) -> None:
-    assert secret_files.in_folder(name)
+    assert program_files.secret_in_folder(name)
 
 
 @pytest.mark.parametrize(
     "name", ["aws", "envs", "environments", "gcloud", "gh", "secrets", ".github"]
 )
 def test_folders_that_are_none(name: str) -> None:
-    assert secret_files.in_folder(name) is None
+    assert program_files.secret_in_folder(name) is None
 
 
 SECRETS = {
@@ -190,7 +190,7 @@ def test_certificates_alone_are_public(tmp_path: Path) -> None:
 
 
 def test_many_certificates_are_public(tmp_path: Path) -> None:
-    many = CERTIFICATE * (2 * secret_files._HEAD // len(CERTIFICATE))
+    many = CERTIFICATE * (2 * program_files._HEAD // len(CERTIFICATE))
     (tmp_path / "cacert.pem").write_text(many)
     assert found(tmp_path / "cacert.pem") is None
     (tmp_path / "all.pem").write_text(many + key())
@@ -208,9 +208,9 @@ def test_only_heads_of_small_files_are_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "data.bin"
-    path.write_bytes(bytes(secret_files._HEAD) + key().encode())
+    path.write_bytes(bytes(program_files._HEAD) + key().encode())
     assert found(path) is None
-    path.write_bytes(key().encode() + bytes(secret_files._SMALL))
+    path.write_bytes(key().encode() + bytes(program_files._SMALL))
     monkeypatch.setattr(os, "open", lambda *_: pytest.fail("opened"))
     assert found(path) is None
 

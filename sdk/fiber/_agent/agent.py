@@ -263,6 +263,16 @@ def _same(one: Blob | None, other: Blob | None) -> bool:
     return one is other or (one is not None and other is not None and one.digest == other.digest)
 
 
+class LocalBackend(Agent):
+    """Backend whose children are subprocesses of this program: an agent in this process."""
+
+    name = "local"
+    elastic = False
+    same_host = True
+    same_pids = True
+    sends_program = False
+
+
 _SEQ = struct.Struct("<Q")
 
 _NO_ROOM = (TooManyOpenFiles, MemoryError)

@@ -190,3 +190,29 @@ class ChildHandle(Protocol):
 
     def signal(self, signum: int) -> None:
         """Send the child a signal, unless it is gone."""
+
+
+class Backend(Protocol):
+    """Owns the agents of one program."""
+
+    name: str
+    same_host: bool
+    """True if its agents run on the program's host, so that descriptors can be handed over."""
+
+    same_pids: bool
+    """True if the pids of its children are those of this host and this PID namespace."""
+
+    elastic: bool
+    """True if a host may be made for a child.  Starting a child does not wait for its host."""
+
+    @property
+    def sends_program(self) -> bool:
+        """True if its agents need the program's files for their children."""
+
+    def child(self, spec: ChildSpec, observer: ChildObserver) -> ChildHandle:
+        """A child to be started, at once or when there is room for it; raises what is known to be
+        in the way.  From anywhere.
+        """
+
+    def close(self) -> None:
+        """End every agent and its children.  Not on the loop's thread."""

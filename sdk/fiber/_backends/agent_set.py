@@ -7,10 +7,10 @@ from collections.abc import Callable
 
 from fiber import _logs
 from fiber._agent.interface import Cause, ChildObserver, ChildSpec, ExitReport
-from fiber._backends.output import Output
 from fiber._backends.remote import RemoteAgent, RemoteChild
 from fiber._engine.placement import Placement
 from fiber._hub.hub import Hub
+from fiber._logs import Output
 from fiber._transport.link import Link
 from fiber._transport.loop import EventLoop
 

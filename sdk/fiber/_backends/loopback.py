@@ -25,12 +25,12 @@ from typing import NamedTuple
 from fiber._agent.interface import ChildObserver, ChildSpec
 from fiber._agent.zygote_process import interpreter_arguments
 from fiber._backends.agent_set import AgentSet
-from fiber._backends.output import Output
 from fiber._backends.remote import RemoteAgent, RemoteChild
 from fiber._engine.placement import Placement
 from fiber._engine.start_failures import StartFailure, StartFailures
 from fiber._hub.directory import remove_directory
 from fiber._hub.hub import Hub
+from fiber._logs import Output
 from fiber._transport.authentication import Identity, join_address
 from fiber._transport.credentials import Credentials, make_credentials
 from fiber._transport.link import Keepalive, Link

@@ -18,8 +18,8 @@ from functools import lru_cache, partial
 from typing import Protocol
 
 from fiber._agent.interface import Cause, ChildObserver, ChildSpec, ExitReport
-from fiber._backends.output import Output
 from fiber._hub.hub import Hub
+from fiber._logs import Output
 from fiber._transport.link import Link
 from fiber._transport.link_protocol import Frame
 from fiber._transport.loop import EventLoop

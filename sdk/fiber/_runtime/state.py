@@ -29,7 +29,7 @@ from fiber.errors import StartError
 from fiber.resources import resources_of
 
 if TYPE_CHECKING:
-    from fiber._backends.local import Backend
+    from fiber._agent.interface import Backend
     from fiber._backends.shipping import Program, Shipping
 
 _WORTH_SHARING = 1 << 16
@@ -219,7 +219,7 @@ class _Releasing:
 
 
 def _make_backend(runtime: Runtime) -> Backend:
-    from fiber._backends.local import LocalBackend
+    from fiber._agent.agent import LocalBackend
 
     loop, hub, settings = runtime.loop, runtime.hub, runtime.config
     if not _may_link:

@@ -4,6 +4,20 @@
 connection. The package does the logins: kubeconfigs with their plugins, accounts of pods, tokens
 that expire. ``Api`` adds the calls, and ``Resource`` the paths of the kinds of objects that a
 program uses.
+
+Errors::
+
+    ApiError
+    ├── Unauthorized  401  it does not know who asks
+    ├── Forbidden     403  quota, policy, or no right
+    ├── NotFound      404  no such object, namespace or kind
+    ├── Conflict      409  the name is taken, or a precondition does not hold
+    ├── Expired       410  a watch that cannot go on from where it was
+    ├── Invalid       the rest of 4xx: asking again will not help
+    └── Transient          perhaps later
+        ├── Unreachable      no answer that could be trusted: no connection, too late, nonsense
+        ├── ServerError      5xx  it, or what it depends on, has failed
+        └── TooManyRequests  429  not now
 """
 
 from __future__ import annotations
@@ -22,21 +36,129 @@ from collections.abc import Iterator, Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict, Unpack
 
-from fiber._backends.kubernetes.api_errors import (
-    Body,
-    Conflict,
-    Transient,
-    Unauthorized,
-    Unreachable,
-    document_of,
-    error_of,
-)
 from fiber.errors import ConfigError
 from fiber_api import names
 
 if TYPE_CHECKING:
     from kubernetes.client import ApiClient
     from urllib3 import BaseHTTPResponse
+
+
+Body = dict[str, Any]
+
+_LONGEST_RETRY_AFTER = 30.0
+"""Seconds; who asks for more is asked all the same."""
+
+_MESSAGE_LIMIT = 2000
+
+
+class ApiError(Exception):
+    """A call that did not succeed.  ``reason`` is the API server's word for why, if it gave one."""
+
+    def __init__(self, message: str, *, status: int = 0, reason: str = "") -> None:
+        super().__init__(message)
+        self.message = message
+        self.status = status
+        self.reason = reason
+
+
+class Unauthorized(ApiError):
+    """The API server does not know who asks."""
+
+
+class Forbidden(ApiError):
+    """A quota, a policy or a missing right forbids it."""
+
+
+class NotFound(ApiError):
+    """No such object, no such namespace or, without a ``reason``, no such kind of object."""
+
+
+class Conflict(ApiError):
+    """The name is taken, or the object is not the one that was meant."""
+
+    repeated = False
+    """True if an earlier attempt of the same call had no answer, and may have taken the name."""
+
+
+class Expired(ApiError):
+    """The server has forgotten the version that a watch was to go on from.  List anew."""
+
+
+class Invalid(ApiError):
+    """The API server cannot accept this, now or later."""
+
+
+class Transient(ApiError):
+    """Not now: asking again may help, no sooner than after ``retry_after`` seconds.
+
+    It is not known whether the call was carried out.
+    """
+
+    def __init__(self, message: str, *, retry_after: float = 0.0, **about: Any) -> None:
+        super().__init__(message, **about)
+        self.retry_after = retry_after
+
+
+class Unreachable(Transient):
+    """No answer came, or none of an API server."""
+
+
+class ServerError(Transient):
+    """The API server, or what it depends on, has failed."""
+
+
+class TooManyRequests(Transient):
+    """The API server has others to serve."""
+
+
+_KINDS: dict[int, type[ApiError]] = {
+    401: Unauthorized,
+    403: Forbidden,
+    404: NotFound,
+    408: Unreachable,
+    409: Conflict,
+    410: Expired,
+    429: TooManyRequests,
+}
+
+
+def document_of(status: int, headers: Mapping[str, str], data: bytes) -> Body:
+    """The document in an answer; what is no success is raised."""
+    try:
+        body = json.loads(data)
+    except (ValueError, RecursionError):
+        body = None
+    if 200 <= status < 300:
+        if isinstance(body, dict):
+            return body
+        # Not shown: it may be half a Secret.
+        raise Unreachable(f"the answer is no JSON object ({len(data)} bytes)", status=status)
+    found = body if isinstance(body, dict) else {}
+    text = str(found.get("message") or "") or data[:200].decode(errors="replace").strip()
+    raise error_of(status, headers, found, text)
+
+
+def error_of(status: int, headers: Mapping[str, str], body: Body, text: str = "") -> ApiError:
+    """The error that a Status document, or what came in its place, tells."""
+    message = (str(body.get("message") or "") or text or f"HTTP status {status}")[:_MESSAGE_LIMIT]
+    kind = _kind_of(status)
+    about: dict[str, Any] = {"status": status, "reason": str(body.get("reason") or "")}
+    if issubclass(kind, Transient):
+        about["retry_after"] = _retry_after(headers, body)
+    return kind(message, **about)
+
+
+def _kind_of(status: int) -> type[ApiError]:
+    if status >= 500:
+        return ServerError
+    return _KINDS.get(status, Invalid) if status >= 400 else Unreachable
+
+
+def _retry_after(headers: Mapping[str, str], body: Body) -> float:
+    """The header is what counts; in a watch there is only the Status document."""
+    text = headers.get("Retry-After") or str((body.get("details") or {}).get("retryAfterSeconds"))
+    return min(float(text), _LONGEST_RETRY_AFTER) if text.isdecimal() else 0.0
 
 
 READ_TIMEOUT = 30.0

@@ -17,8 +17,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from fiber import _logs
-from fiber._backends.kubernetes.api import LEASES, POOLS, SECRETS, TIMEOUT, Api
-from fiber._backends.kubernetes.api_errors import (
+from fiber._backends.kubernetes.api import (
+    LEASES,
+    POOLS,
+    SECRETS,
+    TIMEOUT,
+    Api,
     ApiError,
     Body,
     Conflict,

@@ -15,8 +15,10 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Protocol
 
-from fiber._backends.kubernetes.api import PODS, POOLS, Api
-from fiber._backends.kubernetes.api_errors import (
+from fiber._backends.kubernetes.api import (
+    PODS,
+    POOLS,
+    Api,
     ApiError,
     Body,
     Conflict,

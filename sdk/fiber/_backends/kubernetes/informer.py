@@ -7,8 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
 
-from fiber._backends.kubernetes.api import Api, Watch
-from fiber._backends.kubernetes.api_errors import ApiError, Body, Expired, Transient
+from fiber._backends.kubernetes.api import Api, ApiError, Body, Expired, Transient, Watch
 
 _PAUSE_MIN, _PAUSE_MAX = 0.1, 5.0
 """Seconds before it goes on after an end that came early, growing."""

@@ -15,13 +15,16 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
-from fiber._backends.kubernetes.api_errors import (
+from fiber._backends.kubernetes.api import (
     ApiError,
+    Forbidden,
+    Invalid,
+    NotFound,
     ServerError,
     TooManyRequests,
     Transient,
+    Unauthorized,
     Unreachable,
-    explain,
 )
 from fiber._transport.loop import Loop
 from fiber.errors import FiberPoolError
@@ -344,6 +347,81 @@ def _ending(exitcode: int) -> str:
         return f"was killed by {signal.Signals(-exitcode).name}"
     except ValueError:
         return f"was killed by signal {-exitcode}"
+
+
+def explain(
+    error: ApiError, doing: str, *, pool: str, namespace: str, server: str
+) -> FiberPoolError:
+    """Return an error: what happened, why, what to do.  ``doing``: "make the FiberPool es"."""
+    reason, advice = _advice(error, namespace, server)
+    where = f"cannot {doing} in namespace {namespace!r}"
+    return FiberPoolError(
+        f"{where}: {error.message}. {advice}", pool=pool, namespace=namespace, reason=reason
+    )
+
+
+def _advice(error: ApiError, namespace: str, server: str) -> tuple[str, str]:
+    match error:
+        case Unauthorized():
+            return "Unauthorized", (
+                f"The API server {server} does not accept this program's login, and a renewed one "
+                "neither: look with `kubectl auth whoami` and log in again"
+            )
+        case Forbidden() | Invalid() if "ValidatingAdmissionPolicy" in error.message:
+            return "Refused", (
+                "A policy of the cluster refuses it: change what the policy names with "
+                "fiber.init(template=) or in the pod of this program, or ask an administrator for "
+                "an exception"
+            )
+        case Forbidden() if "quota" in error.message:
+            return "QuotaExceeded", (
+                f"Look with `kubectl get resourcequota -n {namespace}`, and delete what is not "
+                "needed or have the quota raised"
+            )
+        case Forbidden():
+            return "Forbidden", (
+                "Give this program's account the role fiber-user in this namespace: `kubectl "
+                f"create rolebinding NAME -n {namespace} --clusterrole=fiber-user`, with --user= "
+                "or --serviceaccount=NAMESPACE:ACCOUNT"
+            )
+        case NotFound(reason=""):
+            return "NotInstalled", (
+                f"The cluster at {server} knows no FiberPools: install the operator, whose chart "
+                "brings them (`helm install fiber-operator charts/fiber-operator -n fiber-system "
+                "--create-namespace`), or choose another cluster with fiber.init(context=)"
+            )
+        case NotFound() if error.message.startswith("namespaces "):
+            return "NamespaceNotFound", (
+                f"Make it with `kubectl create namespace {namespace}`, or name another one with "
+                "fiber.init(namespace=) or FIBER_NAMESPACE"
+            )
+        case NotFound():
+            return "NotFound", f"Look with `kubectl get fiberpools -n {namespace}` what is there"
+        case Invalid() if "unknown field" in error.message:
+            return "OutdatedDefinition", (
+                "The CustomResourceDefinition fiberpools.fiber.dev is not of this version of "
+                "fiberpool: upgrade the operator with its chart, or install the fiberpool that "
+                "belongs to it"
+            )
+        case ServerError():
+            return error.reason or "InternalError", (
+                f"The API server {server} answers so, with HTTP status {error.status}: it or "
+                "something that it depends on has failed. Look with `kubectl get --raw "
+                "'/readyz?verbose'`, or try again later"
+            )
+        case TooManyRequests():
+            return error.reason or "TooManyRequests", (
+                f"The API server {server} has too much to do, or this account has its share: try "
+                "again later, or look with `kubectl get flowschemas,prioritylevelconfigurations`"
+            )
+        case Transient():
+            return "Unreachable", (
+                f"The API server {server} cannot be reached or does not answer: look with "
+                "`kubectl cluster-info`"
+            )
+    return error.reason or "Invalid", (
+        "Correct what the API server names; fiber.init(template=) decides about pods"
+    )
 
 
 _EXPIRED = "Lease expired"

@@ -19,10 +19,20 @@ import threading
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any, NamedTuple, Protocol
 
-from fiber._backends.kubernetes.api import CLAIMS, NODES, PODS, POOLS, Api
-from fiber._backends.kubernetes.api_errors import ApiError, Body, Forbidden, NotFound, explain
+from fiber._backends.kubernetes.api import (
+    CLAIMS,
+    NODES,
+    PODS,
+    POOLS,
+    Api,
+    ApiError,
+    Body,
+    Forbidden,
+    NotFound,
+)
 from fiber._backends.kubernetes.attached_pool import Master, OwnPool, WarmPool, read_pool_key
 from fiber._backends.kubernetes.fiber_pool import Attachment
+from fiber._backends.kubernetes.problems import explain
 from fiber._backends.kubernetes.template import (
     Shape,
     fiber_pool_body,

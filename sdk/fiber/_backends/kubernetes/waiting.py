@@ -30,7 +30,7 @@ from fiber._backends.kubernetes.problems import (
     unreachable,
 )
 from fiber._backends.kubernetes.program import PreparedPool
-from fiber._backends.output import Output
+from fiber._logs import Output
 from fiber._transport.loop import EventLoop, Loop, ScheduledCall
 from fiber.errors import FiberError
 
