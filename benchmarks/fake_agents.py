@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from fiber._agent.interface import ChildObserver, ChildSpec, ExitReport
-from fiber._agent.worker import Worker
+from fiber._agent.worker import BatchRunner
 from fiber._transport.loop import Loop
 from fiber._wire import work
 from fiber._wire.memory_files import BytesLike
@@ -143,7 +143,7 @@ class TaskRunner:
 
     def __init__(self) -> None:
         self._child: FakeChild | None = None
-        self._worker = Worker(self, memoryview(bytearray(_BOARD)).cast("Q"))
+        self._worker = BatchRunner(self, memoryview(bytearray(_BOARD)).cast("Q"))
 
     def run(self, child: FakeChild, message: Message) -> bool:
         """Run and answer for this child; False if it was asked to stop."""

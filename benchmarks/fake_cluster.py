@@ -20,7 +20,7 @@ from fiber._agent.interface import ChildObserver, ChildSpec
 from fiber._backends.agent_set import AgentSet
 from fiber._backends.remote import RemoteAgent, RemoteChild
 from fiber._engine.placement import Placement
-from fiber._logs import Output
+from fiber._logs import OutputWriter
 from fiber._runtime.state import Runtime
 from fiber._transport.credentials import make_credentials
 from fiber._transport.link import Link
@@ -53,7 +53,7 @@ class FakeCluster:
     def __init__(self, runtime: Runtime, hosts: Sequence[Host], agents: int) -> None:
         assert runtime.hub is not None
         self._hosts = hosts
-        self._output = Output()
+        self._output = OutputWriter()
         self._loop = runtime.loop
         self._names = [f"fake-{number}" for number in range(agents)]
         placement: Placement[RemoteAgent, RemoteChild] = Placement(math.inf, spread=True)

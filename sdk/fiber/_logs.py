@@ -57,7 +57,7 @@ _ERASE = "\r\x1b[K"
 """Takes away what stands in a terminal's last line."""
 
 
-class Output:
+class OutputWriter:
     """Lines on their way to stderr.  One that is slow, stuck or broken holds up nobody: what it
     has no room for is left out, and how much that was is said in its place.
     """

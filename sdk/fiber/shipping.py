@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from multiprocessing import spawn
 
 from fiber._backends import program_files
-from fiber._backends.program_files import Entry, Why
+from fiber._backends.program_files import FileEntry, Why
 from fiber._backends.program_layout import BYTECODE, INCLUDING, LOOSE, Layout, find_layout
 from fiber.errors import in_one_line
 
@@ -119,7 +119,7 @@ _REASONS = {
 }
 
 
-def _sent(layout: Layout, files: dict[str, Entry]) -> Iterator[Sent]:
+def _sent(layout: Layout, files: dict[str, FileEntry]) -> Iterator[Sent]:
     imported = frozenset(layout.files)
     for name, entry in files.items():
         if not stat.S_ISDIR(entry.mode):

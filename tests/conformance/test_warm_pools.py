@@ -7,7 +7,7 @@ import pytest
 from conformance.runner import Target
 from conformance.warm_pools import warm_pools
 from fiber._backends.kubernetes.api import POOLS, Api, NotFound
-from fiber._backends.kubernetes.attached_pool import Master
+from fiber._backends.kubernetes.attached_pool import PoolMaster
 
 VARIABLES = Target("fiber", "spawn", frozenset({"core"}), 60).variables()
 
@@ -22,7 +22,7 @@ def test_a_pool_that_a_killed_interpreter_held_is_replaced(monkeypatch: pytest.M
             monkeypatch.setenv("KUBECONFIG", given["KUBECONFIG"])
             api = Api.connect()
             path = POOLS.path(given["FIBER_NAMESPACE"], given["FIBER_POOL"])
-            master = Master("10.0.0.7", 41337, "killed").spec(given["FIBER_POOL"], 1)
+            master = PoolMaster("10.0.0.7", 41337, "killed").spec(given["FIBER_POOL"], 1)
             api.merge_patch(path, {"spec": {"master": master}})
         with pools.lend() as other:
             assert other["FIBER_POOL"] != given["FIBER_POOL"]

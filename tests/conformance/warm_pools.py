@@ -26,7 +26,7 @@ from typing import Any
 from fakes.cluster import FakeCluster, fake_cluster
 from fiber import config
 from fiber._backends.kubernetes.api import POOLS, Api, NotFound
-from fiber._backends.kubernetes.template import Shape, fiber_pool_body, pod_template
+from fiber._backends.kubernetes.template import PodShape, fiber_pool_body, pod_template
 from fiber_api import names
 from unit.kubernetes_rig import kubeconfig
 
@@ -121,7 +121,7 @@ class WarmPools:
             self._delete(pool)
 
     def _make(self) -> _Pool:
-        template = pod_template(Shape.of(self._config), None, "")
+        template = pod_template(PodShape.of(self._config), None, "")
         worker = next(
             container
             for container in template["spec"]["containers"]

@@ -22,8 +22,8 @@ from faults.program import Program, wait_for
 from faults.proxy import Proxy
 from faults.runtime import running
 from faults.test_pods import pods_of
-from fiber._backends.kubernetes import program
-from fiber._backends.kubernetes.attached_pool import Master
+from fiber._backends.kubernetes import provisioner
+from fiber._backends.kubernetes.attached_pool import PoolMaster
 from fiber.errors import FiberPoolError
 from fiber_api import names
 from fiber_api.names import ConditionType
@@ -40,7 +40,7 @@ _nothing_is_left = test_pods._nothing_is_left
 
 
 @dataclass(frozen=True)
-class ShortLived(Master):
+class ShortLived(PoolMaster):
     """A master whose Lease lasts as short as the API allows."""
 
     lease_duration: int = 5
@@ -98,7 +98,7 @@ class Warm:
 @pytest.fixture
 def warm(cluster: FakeCluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Warm]:
     template = {"spec": {"containers": [{"name": names.WORKER_CONTAINER, "image": "worker"}]}}
-    monkeypatch.setattr(program, "Master", ShortLived)
+    monkeypatch.setattr(provisioner, "PoolMaster", ShortLived)
     with (
         Proxy("127.0.0.1:1") as service,
         Proxy(cluster.url.removeprefix("http://")) as way,

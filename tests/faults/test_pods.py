@@ -23,7 +23,7 @@ from faults.program import Program
 from faults.proxy import Proxy
 from faults.runtime import running
 from fiber._backends.kubernetes.api import Api
-from fiber._backends.kubernetes.program import _local_address
+from fiber._backends.kubernetes.provisioner import _local_address
 from fiber._runtime import state
 from fiber.errors import FiberPoolError, MemberLost, WorkerDied
 from fiber_api import names

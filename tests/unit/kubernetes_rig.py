@@ -15,7 +15,7 @@ import yaml
 from fakes.kubernetes_api import Call
 from fakes.served import Served, served
 from fiber._backends.kubernetes.api import Api
-from fiber._backends.kubernetes.attached_pool import Master, OwnPool, WarmPool
+from fiber._backends.kubernetes.attached_pool import OwnPool, PoolMaster, WarmPool
 from fiber._backends.kubernetes.fiber_pool import FiberPoolClient
 from fiber._transport.credentials import make_credentials
 from fiber._transport.loop import Loop
@@ -24,8 +24,8 @@ from fiber_api import names
 from patience import PATIENCE
 
 NAMESPACE = "lab"
-MASTER = Master("10.0.0.7", 41337, "laptop-7:4711")
-OTHER = Master("10.0.0.8", 41338, "laptop-8:4712")
+MASTER = PoolMaster("10.0.0.7", 41337, "laptop-7:4711")
+OTHER = PoolMaster("10.0.0.8", 41338, "laptop-8:4712")
 Body = dict[str, Any]
 
 
@@ -151,14 +151,14 @@ class Rig:
         told: Told,
         name: str = "es-1",
         owner: Body | None = None,
-        master: Master = MASTER,
+        master: PoolMaster = MASTER,
     ) -> FiberPoolClient:
         """A client that makes a pool."""
         credentials = make_credentials()
         attachment = OwnPool(self.api, NAMESPACE, pool_body(name), credentials, master, owner)
         return self._client(attachment, told)
 
-    def warm(self, told: Told, master: Master = MASTER, name: str = "warm") -> FiberPoolClient:
+    def warm(self, told: Told, master: PoolMaster = MASTER, name: str = "warm") -> FiberPoolClient:
         """A client that attaches to one."""
         return self._client(WarmPool(self.api, NAMESPACE, name, master), told)
 

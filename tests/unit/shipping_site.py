@@ -8,7 +8,7 @@ from typing import Any
 
 from fiber._agent.child import ProgramPaths
 from fiber._agent.zygote import unpack
-from fiber._backends.program_files import Entry, select
+from fiber._backends.program_files import FileEntry, select
 from fiber._backends.program_layout import Layout, Places
 from fiber._backends.shipping import pack
 from fiber._wire.memory_files import Blob
@@ -24,7 +24,7 @@ def layout(*folders: Path, program: Path | None = None, files: tuple[Path, ...] 
     )
 
 
-def files(*folders: Path, **options: Any) -> dict[str, Entry]:
+def files(*folders: Path, **options: Any) -> dict[str, FileEntry]:
     """What is sent of them."""
     return select(layout(*folders, **options)).files
 

@@ -16,7 +16,7 @@ import pytest
 import fiber
 from census import wait_until
 from fiber import reduction
-from fiber._agent.worker import Worker
+from fiber._agent.worker import BatchRunner
 from fiber._hub.client import HubStream
 from fiber._hub.handles import GrantSet, collecting_grants
 from fiber._hub.local import LocalChannel
@@ -124,9 +124,9 @@ def lend(
 
 
 @pytest.fixture
-def worker() -> Iterator[tuple[Worker, Results]]:
+def worker() -> Iterator[tuple[BatchRunner, Results]]:
     results = Results()
-    worker = Worker(results, memoryview(bytearray(16)).cast("Q"))
+    worker = BatchRunner(results, memoryview(bytearray(16)).cast("Q"))
     yield worker, results
     worker.close()
 
@@ -134,7 +134,7 @@ def worker() -> Iterator[tuple[Worker, Results]]:
 @pytest.mark.parametrize("function", [keep, keep_and_return])
 def test_a_result_comes_after_what_the_task_keeps_is_attached(
     lend: Callable[..., tuple[Connection, packet.Message, GrantSet]],
-    worker: tuple[Worker, Results],
+    worker: tuple[BatchRunner, Results],
     wire: Wire,
     is_confirming: Callable[[], bool],
     function: Callable[[Any], Any],
@@ -156,7 +156,7 @@ def test_a_result_comes_after_what_the_task_keeps_is_attached(
 
 def test_what_a_task_does_not_keep_is_not_waited_for(
     lend: Callable[..., tuple[Connection, packet.Message, GrantSet]],
-    worker: tuple[Worker, Results],
+    worker: tuple[BatchRunner, Results],
     wire: Wire,
 ) -> None:
     _, message, grants = lend(forget)
@@ -175,7 +175,7 @@ def use_and_keep(thing: Any) -> None:
 
 def test_what_was_used_is_not_asked_about(
     lend: Callable[..., tuple[Connection, packet.Message, GrantSet]],
-    worker: tuple[Worker, Results],
+    worker: tuple[BatchRunner, Results],
     is_confirming: Callable[[], bool],
 ) -> None:
     reader, message, grants = lend(use_and_keep)

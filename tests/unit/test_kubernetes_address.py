@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from fiber._backends.kubernetes import program
+from fiber._backends.kubernetes import provisioner
 from fiber._backends.kubernetes.api import Forbidden
-from fiber._backends.kubernetes.program import reachable_address, resolved
+from fiber._backends.kubernetes.provisioner import reachable_address, resolved
 from fiber.errors import ConfigError, FiberPoolError
 
 
@@ -44,7 +44,7 @@ class Cluster:
 @pytest.fixture
 def cluster(monkeypatch: pytest.MonkeyPatch) -> Cluster:
     made = Cluster()
-    monkeypatch.setattr(program, "_local_address", made.ways.get)
+    monkeypatch.setattr(provisioner, "_local_address", made.ways.get)
     return made
 
 
@@ -118,9 +118,9 @@ def test_where_only_a_loopback_is_found(cluster: Cluster, useless: str) -> None:
 
 
 def test_the_way_to_this_machine_is_a_loopback() -> None:
-    assert program._local_address("127.0.0.1") == "127.0.0.1"
+    assert provisioner._local_address("127.0.0.1") == "127.0.0.1"
 
 
 def test_there_is_no_way_to_a_name_that_nobody_has(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(socket, "getaddrinfo", nobody)
-    assert program._local_address("nobody") is None
+    assert provisioner._local_address("nobody") is None

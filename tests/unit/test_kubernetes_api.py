@@ -32,10 +32,10 @@ from fiber._backends.kubernetes.api import (
     Invalid,
     NotFound,
     ServerError,
+    ServerUnreachable,
     TooManyRequests,
     Transient,
     Unauthorized,
-    Unreachable,
     error_of,
 )
 from fiber._backends.kubernetes.problems import explain
@@ -124,7 +124,7 @@ def test_without_a_package_it_says_how_to_install_it(
 
 def test_the_package_is_imported_by_whoever_connects_alone() -> None:
     program = (
-        "import sys, fiber._backends.kubernetes.fiber_pool, fiber._backends.kubernetes.program;"
+        "import sys, fiber._backends.kubernetes.fiber_pool, fiber._backends.kubernetes.provisioner;"
         "print([name for name in ('kubernetes', 'urllib3') if name in sys.modules])"
     )
     ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
@@ -294,7 +294,7 @@ def test_an_authority_that_signed_another_server_is_unreachable(
     strangers = make_certificates("localhost", "nobody", valid_for=RUN_VALIDITY)
     (folder / "ca.crt").write_text(strangers.authority)
     api = connect()
-    with pytest.raises(Unreachable, match=r"(?i)certificate"):
+    with pytest.raises(ServerUnreachable, match=r"(?i)certificate"):
         api.list(ALL, timeout=0)
 
 
@@ -392,8 +392,8 @@ def test_who_is_asked_to_come_back_later_does(server: Served, api: Api, status: 
         (Fault(status=503, reason=""), ServerError, "InternalError", "HTTP status 503"),
         (Fault(status=502, text="<html>bad gateway"), ServerError, "InternalError", "bad gateway"),
         (Fault(status=429, reason=""), TooManyRequests, "TooManyRequests", "try again later"),
-        (Fault(), Unreachable, "Unreachable", "cannot be reached.*kubectl cluster-info"),
-        (Fault(status=302, text=""), Unreachable, "Unreachable", "HTTP status 302"),
+        (Fault(), ServerUnreachable, "Unreachable", "cannot be reached.*kubectl cluster-info"),
+        (Fault(status=302, text=""), ServerUnreachable, "Unreachable", "HTTP status 302"),
     ],
 )
 def test_whoever_answers_is_not_out_of_reach(
@@ -406,7 +406,7 @@ def test_whoever_answers_is_not_out_of_reach(
     assert api.trouble == str(caught.value)
     told = explain(caught.value, "list", pool="es", namespace="lab", server="kube")
     assert told.reason == reason
-    assert ("cannot be reached" in str(told)) == (kind is Unreachable)
+    assert ("cannot be reached" in str(told)) == (kind is ServerUnreachable)
     with pytest.raises(type(told), match=said):
         raise told
     server.api.faults.clear()
@@ -432,13 +432,13 @@ def test_attempts_end_when_they_are_cancelled(server: Served, api: Api) -> None:
 
 def test_nobody_who_answers_is_unreachable(api: Api, server: Served) -> None:
     server.api.down = True
-    with pytest.raises(Unreachable):
+    with pytest.raises(ServerUnreachable):
         api.list(ALL, timeout=0.0)
 
 
 def test_garbage_is_not_shown(server: Served, api: Api) -> None:
     server.api.faults.append(Fault(text='["s3cret"', times=9))
-    with pytest.raises(Unreachable) as caught:
+    with pytest.raises(ServerUnreachable) as caught:
         api.list(ALL, timeout=0.0)
     assert "s3cret" not in str(caught.value)
 
@@ -512,5 +512,5 @@ def test_a_watch_that_is_cut_off(server: Served, api: Api) -> None:
     events = iter(api.watch(ALL, {}, version))
     next(events)
     server.do(server.api.drop_watches)
-    with pytest.raises(Unreachable):
+    with pytest.raises(ServerUnreachable):
         next(events)

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from fiber._backends.kubernetes import backend
-from fiber._backends.kubernetes.api import Forbidden, NotFound, Unreachable
+from fiber._backends.kubernetes.api import Forbidden, NotFound, ServerUnreachable
 from fiber._runtime.state import _is_on_cluster
 from fiber.config import Config
 from fiber.errors import ConfigError
@@ -93,7 +93,7 @@ def test_the_right_counts_where_the_pods_are_to_be(monkeypatch: pytest.MonkeyPat
         {"status": {}},
         {},
         Forbidden("no", status=403),
-        Unreachable("no route"),
+        ServerUnreachable("no route"),
         ConfigError("no account"),
     ],
     ids=repr,
@@ -168,7 +168,7 @@ def test_an_operator_of_this_namespace_alone_is_found(
             {"kube-public": FORBIDDEN, "lab": FORBIDDEN},
             "may not be read in the namespace 'kube-public' and may not be read in the namespace",
         ),
-        ({"kube-public": Unreachable("no route")}, "the API server does not say"),
+        ({"kube-public": ServerUnreachable("no route")}, "the API server does not say"),
     ],
     ids=["none", "elsewhere", "dead", "dead-here", "empty", "damaged", "no-right", "no-answer"],
 )

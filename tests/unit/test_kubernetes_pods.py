@@ -12,10 +12,10 @@ import pytest
 
 from fiber._agent.interface import Cause, ChildSpec, ExitReport
 from fiber._backends.agent_set import AgentSet
-from fiber._backends.kubernetes import program, waiting
+from fiber._backends.kubernetes import provisioner, waiting
 from fiber._backends.kubernetes.backend import Pods
-from fiber._backends.kubernetes.program import PreparedPool
-from fiber._backends.kubernetes.template import Shape
+from fiber._backends.kubernetes.provisioner import PreparedPool
+from fiber._backends.kubernetes.template import PodShape
 from fiber._backends.remote import RemoteChild
 from fiber._transport.authentication import Identity
 from fiber._transport.loop import Loop
@@ -265,12 +265,12 @@ def test_what_fails_while_a_pool_is_opened_leaves_nothing_that_listens(
         raise FiberError("no template")
 
     monkeypatch.setenv("KUBECONFIG", str(kubeconfig(tmp_path, "http://127.0.0.1:9")))
-    monkeypatch.setattr(program, "reachable_address", lambda *args, **kwargs: "127.0.0.1")
-    monkeypatch.setattr(program, "pod_template", refuse)
+    monkeypatch.setattr(provisioner, "reachable_address", lambda *args, **kwargs: "127.0.0.1")
+    monkeypatch.setattr(provisioner, "pod_template", refuse)
     nobody: Any = None
-    ours = program.Program(Config())
+    ours = provisioner.PoolProvisioner(Config())
     with pytest.raises(FiberError, match="no template"):
-        ours.prepare_own(Shape(), site.loop, nobody, threading.Event())
+        ours.prepare_own(PodShape(), site.loop, nobody, threading.Event())
     assert not [t for t in threading.enumerate() if t.name == "fiber-accept"]
     ours.api.close()
 

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from fiber._backends.kubernetes.problems import (
+    AgentRoute,
     PoolName,
-    Way,
     failure,
     new_problems,
     overdue,
@@ -21,7 +21,7 @@ from fiber_api.times import parse_time
 POOL = PoolName("es-1a2b3c", "team")
 SINCE = "2026-11-21T14:56:13Z"
 NOW = parse_time(SINCE) + 14
-WAY = Way("10.0.0.7:41337")
+WAY = AgentRoute("10.0.0.7:41337")
 SCHEDULER = (
     "0/3 nodes are available: 1 node(s) had untolerated taint {node.kubernetes.io/disk: }, "
     "2 Insufficient cpu"
@@ -168,7 +168,7 @@ class TestUnreachable:
         assert "its running pod has" in str(unreachable(POOL, status(replicas=1), 8.0, WAY))
 
     def test_of_a_pool_that_was_taken_over_names_its_last_master(self) -> None:
-        way = Way("10.0.0.7:41337", displaced="laptop-8:4712")
+        way = AgentRoute("10.0.0.7:41337", displaced="laptop-8:4712")
         told = str(unreachable(POOL, status(replicas=1), 8.0, way))
         assert "Or the pods still serve laptop-8:4712" in told
 

@@ -12,10 +12,10 @@ from unittest.mock import Mock
 import pytest
 
 from fakes.kubernetes_api import Fault
-from fiber._backends.kubernetes import program
+from fiber._backends.kubernetes import provisioner
 from fiber._backends.kubernetes.attached_pool import OwnPool
-from fiber._backends.kubernetes.program import Claims, Program, without_claims
-from fiber._backends.kubernetes.template import Shape
+from fiber._backends.kubernetes.provisioner import PoolProvisioner, VolumeClaims, without_claims
+from fiber._backends.kubernetes.template import PodShape
 from fiber._transport.loop import Loop
 from fiber.config import Config
 from fiber.errors import ConfigError
@@ -33,7 +33,7 @@ def a_rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
     ("name", "why"), [("laptop", "with hostNetwork"), ("a" * 63, "cut after 63 characters")]
 )
 def test_the_reason_why_the_own_pod_is_not_found(rig: Rig, name: str, why: str) -> None:
-    made = Program(Config())
+    made = PoolProvisioner(Config())
     try:
         with pytest.raises(ConfigError, match=f"{why}.*fieldRef"):
             made._read_own_pod(name, threading.Event())
@@ -42,9 +42,9 @@ def test_the_reason_why_the_own_pod_is_not_found(rig: Rig, name: str, why: str) 
 
 
 def test_variables_that_stay_behind_are_named(capsys: pytest.CaptureFixture[str]) -> None:
-    program._say_what_stays_behind([])
+    provisioner._say_what_stays_behind([])
     assert capsys.readouterr().err == ""
-    program._say_what_stays_behind(["API_KEY", "TOKEN"])
+    provisioner._say_what_stays_behind(["API_KEY", "TOKEN"])
     assert "API_KEY, TOKEN" in capsys.readouterr().err
 
 
@@ -68,7 +68,7 @@ POD = {
 }
 
 
-def prepared(made: Program, shape: Shape) -> dict[str, Any]:
+def prepared(made: PoolProvisioner, shape: PodShape) -> dict[str, Any]:
     """The pod template of a pool that is prepared in the pod."""
     loop = Loop()
     loop.start_thread("test-io")
@@ -87,16 +87,16 @@ def prepared(made: Program, shape: Shape) -> dict[str, Any]:
 def test_a_claim_of_one_node_stays_behind_and_is_named_once(
     rig: Rig, mode: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(program, "reachable_address", lambda *args, **kwargs: "127.0.0.1")
+    monkeypatch.setattr(provisioner, "reachable_address", lambda *args, **kwargs: "127.0.0.1")
     modes = {"one-claim": [mode], "shared-claim": [mode, "ReadOnlyMany"]}
     for name, allowed in modes.items():
         claim = {"metadata": {"name": name}, "spec": {"accessModes": allowed}}
         rig.server.do(rig.server.store.create, "persistentvolumeclaims", NAMESPACE, claim)
     rig.server.api.faults.append(Fault("get", name="secret-claim", status=403, times=math.inf))
-    made = Program(Config())
+    made = PoolProvisioner(Config())
     made._find_own_pod = lambda cancel: POD  # type: ignore[method-assign]
     try:
-        spec = prepared(made, Shape())
+        spec = prepared(made, PodShape())
         assert [volume["name"] for volume in spec["volumes"]] == ["shared", "secret"]
         (worker,) = spec["containers"]
         assert [mount["name"] for mount in worker["volumeMounts"]] == ["shared", "secret"]
@@ -104,13 +104,13 @@ def test_a_claim_of_one_node_stays_behind_and_is_named_once(
         assert "mount the PersistentVolumeClaim secret-claim" in unread
         assert "do not get the PersistentVolumeClaims one-claim:" in left_out
         assert "fiber.init(template=)" in left_out
-        assert len(prepared(made, Shape(image="other"))["volumes"]) == 2
+        assert len(prepared(made, PodShape(image="other"))["volumes"]) == 2
         assert capsys.readouterr().err == ""
     finally:
         made.close()
 
 
 def test_a_claim_that_the_template_brings_is_not_told(rig: Rig) -> None:
-    claims = Claims(("one-claim",))
+    claims = VolumeClaims(("one-claim",))
     assert claims.warnings(POD) == []
     assert len(claims.warnings(without_claims(POD, claims.one_node))) == 1

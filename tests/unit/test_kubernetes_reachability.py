@@ -9,13 +9,13 @@ import pytest
 
 from fiber._agent.interface import ChildSpec, ExitReport
 from fiber._backends.agent_set import AgentSet
-from fiber._backends.kubernetes.problems import PoolName, Way
+from fiber._backends.kubernetes.problems import AgentRoute, PoolName
 from fiber._backends.kubernetes.waiting import (
     DOUBTED_AFTER,
     GIVEN_UP_AFTER,
     Reachability,
-    Verdict,
-    Waiting,
+    ReachabilityProbe,
+    WaitingChildren,
 )
 from fiber._engine.placement import Placement
 from memory_link import SimulatedLoop
@@ -25,40 +25,40 @@ ERROR_AT = DOUBTED_AFTER + GIVEN_UP_AFTER
 
 class TestReachability:
     def test_doubts_and_gives_up_by_the_time_since_the_first_running_pod(self) -> None:
-        found = Reachability()
-        assert found.judge(1, 100.0) is Verdict.OPEN
+        found = ReachabilityProbe()
+        assert found.judge(1, 100.0) is Reachability.OPEN
         assert found.due == 100.0 + DOUBTED_AFTER
-        assert found.judge(1, found.due) is Verdict.DOUBTFUL
+        assert found.judge(1, found.due) is Reachability.DOUBTFUL
         assert found.due == 100.0 + ERROR_AT
-        assert found.judge(1, found.due) is Verdict.UNREACHABLE
+        assert found.judge(1, found.due) is Reachability.UNREACHABLE
 
     def test_gives_the_newest_pod_time_to_dial(self) -> None:
         """Pods begin to run one by one while an image is pulled."""
-        found = Reachability()
+        found = ReachabilityProbe()
         found.judge(1, 0.0)
         found.judge(1, DOUBTED_AFTER)
-        assert found.judge(2, ERROR_AT - 1.0) is Verdict.DOUBTFUL
+        assert found.judge(2, ERROR_AT - 1.0) is Reachability.DOUBTFUL
         assert found.due == ERROR_AT - 1.0 + DOUBTED_AFTER
-        assert found.judge(2, found.due) is Verdict.UNREACHABLE
+        assert found.judge(2, found.due) is Reachability.UNREACHABLE
 
     def test_concludes_nothing_once_an_agent_has_dialled(self) -> None:
-        found = Reachability()
+        found = ReachabilityProbe()
         found.judge(1, 0.0)
         found.prove()
-        assert found.judge(4, 1000.0) is Verdict.OPEN
+        assert found.judge(4, 1000.0) is Reachability.OPEN
 
     def test_begins_anew_when_no_pod_ran_for_a_while(self) -> None:
-        found = Reachability()
+        found = ReachabilityProbe()
         found.judge(2, 0.0)
-        assert found.judge(0, 5.0) is Verdict.OPEN
-        assert found.judge(1, 6.0) is Verdict.OPEN
+        assert found.judge(0, 5.0) is Reachability.OPEN
+        assert found.judge(1, 6.0) is Reachability.OPEN
         assert found.due == 6.0 + DOUBTED_AFTER
 
     def test_begins_anew_when_the_program_was_stopped(self) -> None:
         """Agents wait in its backlog, and a timer may come first."""
-        found = Reachability()
+        found = ReachabilityProbe()
         found.judge(2, 0.0)
-        assert found.judge(2, 1000.0) is Verdict.OPEN
+        assert found.judge(2, 1000.0) is Reachability.OPEN
         assert found.due == 1000.0 + DOUBTED_AFTER
 
 
@@ -76,9 +76,9 @@ class Site:
         api: Any = SimpleNamespace(server="kube", trouble=None)
         placement: Placement[Any, Any] = Placement(1, spread=False)
         self.agents = AgentSet(self.loop, hub, output, placement)
-        self.waiting = Waiting(self.agents, output, api, 600.0, on_begin=lambda: None)
+        self.waiting = WaitingChildren(self.agents, output, api, 600.0, on_begin=lambda: None)
         self.waiting.pool = PoolName("es-1", "lab")
-        self.waiting.way = Way("10.0.0.7:41337", displaced)
+        self.waiting.way = AgentRoute("10.0.0.7:41337", displaced)
         self.waiting.attached = True
 
     def start(self) -> Any:

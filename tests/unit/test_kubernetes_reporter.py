@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from fiber._backends.kubernetes.api import Forbidden, ServerError, Unreachable
+from fiber._backends.kubernetes.api import Forbidden, ServerError, ServerUnreachable
 from fiber._backends.kubernetes.problems import PoolName, Reporter
 from fiber.errors import FiberPoolError
 
@@ -61,16 +61,16 @@ def test_a_fault_of_ours_has_its_cause(told: Told) -> None:
 
 def test_what_lasts_is_told_once_whatever_it_keeps_from_being_done(told: Told) -> None:
     for doing in ("scale", "watch", "scale"):
-        told.reporter.trouble(doing, Unreachable("no route"))
+        told.reporter.trouble(doing, ServerUnreachable("no route"))
     assert told.starts() == ["warning: cannot scale the"]
     told.reporter.trouble("watch", ServerError("etcd", status=500))
     assert told.starts()[1:] == ["warning: cannot watch the"]
 
 
 def test_it_is_news_again_once_it_had_passed(told: Told) -> None:
-    told.reporter.trouble("scale", Unreachable("no route"))
+    told.reporter.trouble("scale", ServerUnreachable("no route"))
     told.reporter.answered()
-    told.reporter.trouble("scale", Unreachable("no route"))
+    told.reporter.trouble("scale", ServerUnreachable("no route"))
     assert len(told.said) == 2
 
 
@@ -86,6 +86,6 @@ def test_an_answer_gives_nobody_a_right(told: Told) -> None:
 
 def test_of_a_pool_that_is_given_back_nothing_is_told(told: Told) -> None:
     told.reporter.mute()
-    told.reporter.trouble("scale", Unreachable("no route"))
+    told.reporter.trouble("scale", ServerUnreachable("no route"))
     told.reporter.fail(told.reporter.error("Deleted", "was deleted"))
     assert told.said == []

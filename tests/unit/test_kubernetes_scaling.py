@@ -13,9 +13,9 @@ from fiber._backends.kubernetes.api import (
     Forbidden,
     Invalid,
     ServerError,
+    ServerUnreachable,
     TooManyRequests,
     Unauthorized,
-    Unreachable,
 )
 from fiber._backends.kubernetes.fiber_pool import PATCH_INTERVAL, REFUSED, Scaling
 from fiber.errors import FiberPoolError
@@ -104,7 +104,7 @@ def test_more_names_than_one_patch_may_have_wait_for_room(case: Case) -> None:
 
 
 def test_what_failed_is_tried_again_with_growing_pauses_and_what_is_newest(case: Case) -> None:
-    case.pool.failures = [Unreachable("down") for _ in range(8)]
+    case.pool.failures = [ServerUnreachable("down") for _ in range(8)]
     case.want(1)
     pauses = [case.step()]
     case.want(5)
@@ -134,7 +134,7 @@ def test_a_refusal_may_pass_but_not_for_ever(case: Case, kind: type[ApiError]) -
 
 
 def test_an_api_that_is_gone_is_waited_for(case: Case) -> None:
-    case.pool.failures = [Unreachable("down") for _ in range(50)]
+    case.pool.failures = [ServerUnreachable("down") for _ in range(50)]
     case.want(1)
     pause = case.step()
     while not case.pool.written:

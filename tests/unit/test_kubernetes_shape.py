@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from fiber._backends.kubernetes.template import Shape, pool_name, program_name, read_template
+from fiber._backends.kubernetes.template import PodShape, pool_name, program_name, read_template
 from fiber.config import Config
 from fiber.errors import ConfigError
 from fiber.resources import Resources
@@ -17,26 +17,26 @@ GPU = {"spec": {"nodeSelector": {"gpu": "yes"}}}
 
 
 def test_equal_shapes_are_one_key() -> None:
-    first = Shape.of(Config(image="es:1", template={"spec": {"a": 1, "b": 2}}))
-    second = Shape.of(Config(image="es:1", template={"spec": {"b": 2, "a": 1}}))
+    first = PodShape.of(Config(image="es:1", template={"spec": {"a": 1, "b": 2}}))
+    second = PodShape.of(Config(image="es:1", template={"spec": {"b": 2, "a": 1}}))
     assert {first: "pool"}[second] == "pool"
 
 
 @pytest.mark.parametrize(
     "other",
     [
-        Shape.of(Config(image="es:2")),
-        Shape.of(Config(template=GPU)),
-        Shape.of(Config(processes_per_pod=8)),
-        Shape().with_resources(Resources(gpu=1)),
+        PodShape.of(Config(image="es:2")),
+        PodShape.of(Config(template=GPU)),
+        PodShape.of(Config(processes_per_pod=8)),
+        PodShape().with_resources(Resources(gpu=1)),
     ],
 )
-def test_whatever_decides_what_a_pod_is_like_makes_another_shape(other: Shape) -> None:
-    assert other != Shape.of(Config())
+def test_whatever_decides_what_a_pod_is_like_makes_another_shape(other: PodShape) -> None:
+    assert other != PodShape.of(Config())
 
 
 def test_what_a_pod_does_not_show_is_no_part_of_a_shape() -> None:
-    assert Shape.of(Config(idle_timeout=5, max_pods=3, retries=0)) == Shape.of(Config())
+    assert PodShape.of(Config(idle_timeout=5, max_pods=3, retries=0)) == PodShape.of(Config())
 
 
 @pytest.mark.parametrize(
@@ -66,13 +66,13 @@ def test_a_program_is_called_what_people_know_it_by(path: str | None, name: str)
     ],
 )
 def test_a_pool_is_called_after_the_program_and_its_wishes(resources: Resources, name: str) -> None:
-    assert pool_name("es", Shape().with_resources(resources), "1a2b3c") == name
+    assert pool_name("es", PodShape().with_resources(resources), "1a2b3c") == name
 
 
 @pytest.mark.parametrize("program", ["x" * 80, "a-" * 40, "Übung", "_", "9", "es"])
 @pytest.mark.parametrize("resources", [Resources(), Resources(cpu=0.0001, memory=10**9, gpu=1000)])
 def test_every_name_is_one_that_a_pool_may_have(program: str, resources: Resources) -> None:
-    name = pool_name(program, Shape().with_resources(resources), "1a2b3c")
+    name = pool_name(program, PodShape().with_resources(resources), "1a2b3c")
     assert names.check_pool_name(name) == name
     assert name.endswith("-1a2b3c")
 
@@ -104,7 +104,7 @@ class TestTemplates:
         if text is not None:
             path.write_bytes(text.encode("utf-8", "surrogateescape"))
         with pytest.raises(ConfigError, match="cannot read the pod template") as caught:
-            Shape.of(Config(template=str(path)))
+            PodShape.of(Config(template=str(path)))
         assert str(path) in str(caught.value)
 
     @pytest.mark.parametrize(
@@ -126,7 +126,7 @@ class TestTemplates:
         self, template: dict[str, Any], complaint: str
     ) -> None:
         with pytest.raises(ConfigError, match=complaint):
-            Shape.of(Config(template=template))
+            PodShape.of(Config(template=template))
 
     def test_a_list_is_none(self, tmp_path: Path) -> None:
         (tmp_path / "pod.yaml").write_text("- spec: {}\n")

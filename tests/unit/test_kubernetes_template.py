@@ -13,7 +13,7 @@ import fiber
 from cluster import images, places
 from fiber._backends.kubernetes.template import (
     WORKER_IMAGE,
-    Shape,
+    PodShape,
     fiber_pool_body,
     own_container,
     pod_template,
@@ -98,13 +98,13 @@ def worker_of(template: dict[str, Any]) -> dict[str, Any]:
     return dict(worker)
 
 
-def like(shape: Shape | None = None, pod: dict[str, Any] = POD) -> dict[str, Any]:
-    return pod_template(shape or Shape(), pod, "main", PYTHON)
+def like(shape: PodShape | None = None, pod: dict[str, Any] = POD) -> dict[str, Any]:
+    return pod_template(shape or PodShape(), pod, "main", PYTHON)
 
 
 class TestElsewhere:
     def test_a_pod_is_this_versions_worker(self) -> None:
-        template = pod_template(Shape(), None, "", PYTHON)
+        template = pod_template(PodShape(), None, "", PYTHON)
         assert template == {
             "spec": {"containers": [{"name": "worker", "image": WORKER_IMAGE, "command": AGENT}]}
         }
@@ -117,7 +117,7 @@ class TestElsewhere:
         assert f"{found[1]}:{fiber.__version__}" == WORKER_IMAGE
 
     def test_the_configured_image_takes_its_place(self) -> None:
-        template = pod_template(Shape(image="es:1"), None, "", PYTHON)
+        template = pod_template(PodShape(image="es:1"), None, "", PYTHON)
         assert worker_of(template) == {"name": "worker", "image": "es:1", "command": AGENT}
 
 
@@ -205,14 +205,14 @@ class TestInAPod:
         assert worker_of(like())["command"] == [PYTHON, "-m", "fiber.agent"]
 
     def test_in_another_image_it_is_the_one_that_is_found(self) -> None:
-        worker = worker_of(like(Shape(image="es:1")))
+        worker = worker_of(like(PodShape(image="es:1")))
         assert worker["command"] == AGENT
         assert worker["image"] == "es:1"
         assert "imagePullPolicy" not in worker
 
     def test_the_programs_own_pod_is_not_changed(self) -> None:
         before = copy.deepcopy(POD)
-        like(Shape(image="es:1").with_resources(Resources(cpu=1)))
+        like(PodShape(image="es:1").with_resources(Resources(cpu=1)))
         assert before == POD
 
     def test_a_pod_with_nothing_in_it_is_enough(self) -> None:
@@ -226,18 +226,18 @@ class TestInAPod:
 
 class TestResources:
     def test_wishes_are_guaranteed(self) -> None:
-        shape = Shape().with_resources(Resources(cpu=0.5, memory=512))
+        shape = PodShape().with_resources(Resources(cpu=0.5, memory=512))
         assert worker_of(like(shape))["resources"] == {
             "requests": {"cpu": "500m", "memory": "512Mi"},
             "limits": {"cpu": "500m", "memory": "512Mi"},
         }
 
     def test_a_gpu_is_a_limit(self) -> None:
-        shape = Shape().with_resources(Resources(gpu=1))
+        shape = PodShape().with_resources(Resources(gpu=1))
         assert worker_of(like(shape))["resources"] == {"limits": {"nvidia.com/gpu": "1"}}
 
     def test_they_are_those_of_each_process(self) -> None:
-        shape = Shape(processes_per_pod=4).with_resources(Resources(cpu=0.3, memory=100, gpu=2))
+        shape = PodShape(processes_per_pod=4).with_resources(Resources(cpu=0.3, memory=100, gpu=2))
         assert worker_of(like(shape))["resources"] == {
             "requests": {"cpu": "1200m", "memory": "400Mi"},
             "limits": {"cpu": "1200m", "memory": "400Mi", "nvidia.com/gpu": "8"},
@@ -245,22 +245,22 @@ class TestResources:
 
     def test_requests_of_the_configuration_are_for_functions_without_wishes(self) -> None:
         config = Config(cpu_request=0.1, memory_request=64, processes_per_pod=2)
-        assert worker_of(like(Shape.of(config)))["resources"] == {
+        assert worker_of(like(PodShape.of(config)))["resources"] == {
             "requests": {"cpu": "200m", "memory": "128Mi"}
         }
-        wishing = Shape.of(config).with_resources(Resources(cpu=1))
+        wishing = PodShape.of(config).with_resources(Resources(cpu=1))
         assert worker_of(like(wishing))["resources"] == {
             "requests": {"cpu": "2", "memory": "128Mi"},
             "limits": {"cpu": "2"},
         }
 
     def test_a_request_of_nothing_is_left_out(self) -> None:
-        shape = Shape.of(Config(cpu_request=0, memory_request=0))
+        shape = PodShape.of(Config(cpu_request=0, memory_request=0))
         assert "resources" not in worker_of(like(shape))
 
     def test_a_template_that_limits_a_resource_has_requested_it(self) -> None:
         worker = {"name": "worker", "resources": {"limits": {"memory": "32Mi"}}}
-        shape = Shape.of(Config(template={"spec": {"containers": [worker]}}))
+        shape = PodShape.of(Config(template={"spec": {"containers": [worker]}}))
         assert worker_of(like(shape))["resources"] == {
             "limits": {"memory": "32Mi"},
             "requests": {"cpu": "50m"},
@@ -268,19 +268,19 @@ class TestResources:
 
     def test_extended_resources_are_limits(self) -> None:
         wishes = Resources(extended=(("amd.com/gpu", 1),))
-        shape = Shape(processes_per_pod=2).with_resources(wishes)
+        shape = PodShape(processes_per_pod=2).with_resources(wishes)
         assert worker_of(like(shape))["resources"] == {"limits": {"amd.com/gpu": "2"}}
 
     def test_nodes_are_those_of_program_configuration_and_function(self) -> None:
         config = Config(node_selector={"disk": "ssd"}, tolerations=({"key": "spot"},))
         wishes = Resources(node_selector=(("zone", "b"),), tolerations=((("key", "gpu"),),))
-        spec = like(Shape.of(config).with_resources(wishes))["spec"]
+        spec = like(PodShape.of(config).with_resources(wishes))["spec"]
         assert spec["nodeSelector"] == {"zone": "b", "disk": "ssd"}
         spot = {"key": "spot", "operator": "Exists"}
         assert spec["tolerations"] == [spot, {"key": "spot"}, {"key": "gpu"}]
 
     def test_shared_memory_counts_to_the_memory(self) -> None:
-        shape = Shape.of(Config(shm=2048, processes_per_pod=2))
+        shape = PodShape.of(Config(shm=2048, processes_per_pod=2))
         template = like(shape.with_resources(Resources(memory=100)))
         worker = worker_of(template)
         assert worker["resources"]["limits"] == {"memory": "2248Mi"}
@@ -294,17 +294,17 @@ class TestResources:
         pod["spec"]["volumes"].append({"name": "shm", "emptyDir": {"medium": "Memory"}})
         mounts = pod["spec"]["containers"][1]["volumeMounts"]
         mounts.append({"name": "shm", "mountPath": "/dev/shm"})
-        spec = like(Shape.of(Config(shm=64, cpu_request=0)), pod)["spec"]
+        spec = like(PodShape.of(Config(shm=64, cpu_request=0)), pod)["spec"]
         assert [v["name"] for v in spec["volumes"]] == ["data", "fiber-shm"]
         assert worker_of({"spec": spec})["resources"] == {"requests": {"memory": "128Mi"}}
 
     def test_no_gpu_is_nothing_to_ask_for(self) -> None:
-        assert "resources" not in worker_of(like(Shape().with_resources(Resources(gpu=0))))
+        assert "resources" not in worker_of(like(PodShape().with_resources(Resources(gpu=0))))
 
 
 class TestTheUsersTemplate:
     def template(self, spec: dict[str, Any], **wishes: Any) -> dict[str, Any]:
-        shape = Shape.of(Config(template={"spec": spec}))
+        shape = PodShape.of(Config(template={"spec": spec}))
         return like(shape.with_resources(Resources(**wishes)))
 
     def test_wins_over_all(self) -> None:
@@ -326,7 +326,7 @@ class TestTheUsersTemplate:
         assert {key: worker[key] for key in worker if key in ("command", "args")} == {field: ["x"]}
 
     def test_may_have_metadata(self) -> None:
-        template = like(Shape.of(Config(template={"metadata": {"labels": {"team": "a"}}})))
+        template = like(PodShape.of(Config(template={"metadata": {"labels": {"team": "a"}}})))
         assert template["metadata"] == {"labels": {"team": "a"}}
 
 
@@ -351,7 +351,7 @@ class TestOwnContainer:
 
 def test_a_fiber_pool_is_one_that_the_operator_can_read() -> None:
     config = Config(max_pods=50, processes_per_pod=8, idle_timeout=1.5)
-    body = fiber_pool_body("es-1a2b3c", pod_template(Shape(), None, ""), config)
+    body = fiber_pool_body("es-1a2b3c", pod_template(PodShape(), None, ""), config)
     pool = FiberPool.read(body)
     assert body["metadata"]["labels"] == {names.LABEL_MANAGED_BY: names.SDK_MANAGER}
     assert pool.metadata.name == "es-1a2b3c"
@@ -359,4 +359,4 @@ def test_a_fiber_pool_is_one_that_the_operator_can_read() -> None:
     assert pool.spec.max_replicas == 50
     assert pool.spec.processes_per_pod == 8
     assert pool.spec.scale_down.idle_timeout_seconds == 2
-    assert pool.spec.template == pod_template(Shape(), None, "")
+    assert pool.spec.template == pod_template(PodShape(), None, "")

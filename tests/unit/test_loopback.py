@@ -29,7 +29,7 @@ from fiber._backends.remote import RemoteAgent, RemoteChild
 from fiber._engine import start_failures
 from fiber._engine.start_failures import TRIES
 from fiber._hub.protocol import HubAddress
-from fiber._logs import Output
+from fiber._logs import OutputWriter
 from fiber._runtime import state
 from fiber._transport import listener
 from fiber._wire import messages
@@ -501,7 +501,7 @@ class Silent(ReadLink):
 @pytest.fixture
 def remote() -> tuple[RemoteAgent, Silent, Recorder]:
     link, unheard = Silent(), mock.Mock()
-    agent = RemoteAgent("far", link, SimulatedLoop(), link, Output(), unheard)  # type: ignore[arg-type]
+    agent = RemoteAgent("far", link, SimulatedLoop(), link, OutputWriter(), unheard)  # type: ignore[arg-type]
     observer = Recorder()
     RemoteChild(agent, ChildSpec("child", "fork", b"", b"", tasks=True), observer).start()
     return agent, link, observer

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 
 from fiber._backends import output
-from fiber._logs import Output
+from fiber._logs import OutputWriter
 from patience import PATIENCE
 
 SAID = re.compile(r"\[fiber\] (\d+) lines are left out here")
@@ -47,8 +47,8 @@ def stderr(monkeypatch: pytest.MonkeyPatch) -> Stuck:
 
 
 @pytest.fixture
-def lines(stderr: Stuck) -> Iterator[Output]:
-    lines = Output()
+def lines(stderr: Stuck) -> Iterator[OutputWriter]:
+    lines = OutputWriter()
     yield lines
     stderr.goes_on.set()
     lines.close()
@@ -59,7 +59,7 @@ def numbers(stderr: Stuck) -> list[int]:
 
 
 def test_what_a_stuck_stderr_has_no_room_for_is_left_out_and_counted(
-    stderr: Stuck, lines: Output
+    stderr: Stuck, lines: OutputWriter
 ) -> None:
     for number in range(1000):
         lines.write("w", f"line {number}")
@@ -71,7 +71,9 @@ def test_what_a_stuck_stderr_has_no_room_for_is_left_out_and_counted(
     assert SAID.findall(stderr.getvalue()) == [str(1000 - len(written))]
 
 
-def test_what_comes_after_a_gap_follows_what_is_said_of_it(stderr: Stuck, lines: Output) -> None:
+def test_what_comes_after_a_gap_follows_what_is_said_of_it(
+    stderr: Stuck, lines: OutputWriter
+) -> None:
     for number in range(1000):
         lines.write("w", f"line {number}")
     stderr.goes_on.set()
@@ -82,7 +84,7 @@ def test_what_comes_after_a_gap_follows_what_is_said_of_it(stderr: Stuck, lines:
     assert "left out" in stderr.getvalue().splitlines()[-2]
 
 
-def test_what_is_left_out_at_the_end_is_said_too(stderr: Stuck, lines: Output) -> None:
+def test_what_is_left_out_at_the_end_is_said_too(stderr: Stuck, lines: OutputWriter) -> None:
     for number in range(1000):
         lines.write("w", f"line {number}")
     threading.Timer(0.05, stderr.goes_on.set).start()
@@ -90,7 +92,7 @@ def test_what_is_left_out_at_the_end_is_said_too(stderr: Stuck, lines: Output) -
     assert "left out" in stderr.getvalue().splitlines()[-1]
 
 
-def test_what_keeps_up_loses_nothing(stderr: Stuck, lines: Output) -> None:
+def test_what_keeps_up_loses_nothing(stderr: Stuck, lines: OutputWriter) -> None:
     stderr.goes_on.set()
     for number in range(1000):
         lines.write("w", f"line {number}")
@@ -98,7 +100,7 @@ def test_what_keeps_up_loses_nothing(stderr: Stuck, lines: Output) -> None:
     assert numbers(stderr) == list(range(1000))
 
 
-def test_a_line_stands_below_what_is_written(stderr: Stuck, lines: Output) -> None:
+def test_a_line_stands_below_what_is_written(stderr: Stuck, lines: OutputWriter) -> None:
     stderr.goes_on.set()
     lines.show("1 of 2")
     stderr.wait_for("1 of 2")
@@ -112,14 +114,16 @@ def test_a_line_stands_below_what_is_written(stderr: Stuck, lines: Output) -> No
     assert stderr.getvalue() == f"1 of 2{erase}[w] line 1\n1 of 2{erase}2 of 2{erase}"
 
 
-def test_a_line_that_stands_goes_at_the_end(stderr: Stuck, lines: Output) -> None:
+def test_a_line_that_stands_goes_at_the_end(stderr: Stuck, lines: OutputWriter) -> None:
     stderr.goes_on.set()
     lines.show("1 of 2")
     lines.close()
     assert stderr.getvalue() in (f"1 of 2{output._ERASE}", "")
 
 
-def test_a_stuck_stderr_gathers_no_lines_that_were_shown(stderr: Stuck, lines: Output) -> None:
+def test_a_stuck_stderr_gathers_no_lines_that_were_shown(
+    stderr: Stuck, lines: OutputWriter
+) -> None:
     for number in range(1000):
         lines.show(f"{number} of 1000")
     assert lines._lines.qsize() <= 2

@@ -10,9 +10,9 @@ from gymnasium.spaces import Discrete
 from gymnasium.vector import AutoresetMode
 
 from fiber.vector import worker as worker_module
-from fiber.vector.arrays import Shape, SharedMemory
+from fiber.vector.arrays import ArrayLayout, ArrayMemory
 from fiber.vector.slot import Slot
-from fiber.vector.worker import Begin, Setup, Worker
+from fiber.vector.worker import Begin, EnvironmentWorker, Setup
 
 ROWS = 4
 MS = 1e-3
@@ -44,12 +44,12 @@ def told(
     """The rows of each answer to a step, when it is known how long each takes."""
     clock, answers = Clock(), []
     monkeypatch.setattr(worker_module, "time", clock)
-    shape = Shape(Discrete(2), Discrete(2), ROWS, 1)
-    memory = SharedMemory.allocate(shape.size()) if shared else None
+    shape = ArrayLayout(Discrete(2), Discrete(2), ROWS, 1)
+    memory = ArrayMemory.allocate(shape.size()) if shared else None
     connection: Any = SimpleNamespace(_send_unconfirmed=lambda answer: answers.append(answer.rows))
     setup = Setup(0, 0, [], AutoresetMode.NEXT_STEP, restart=False, timeout=None)
     slots = [Steps(clock, each) for each in seconds]
-    worker = Worker(connection, setup, slots, Begin(shape, memory))
+    worker = EnvironmentWorker(connection, setup, slots, Begin(shape, memory))
     for _ in range(100):
         worker._step(0, None, [0] * ROWS, together=True)
     answers.clear()

@@ -10,7 +10,7 @@ from gymnasium.vector import AutoresetMode
 import fiber
 from fiber.vector import worker_process
 from fiber.vector.worker import Setup
-from fiber.vector.worker_process import GRACE, Pending, WorkerProcess
+from fiber.vector.worker_process import GRACE, PendingCommand, WorkerProcess
 from vector_envs import Faulty
 
 TIMEOUT = 2.0
@@ -21,7 +21,7 @@ def patience(monkeypatch: pytest.MonkeyPatch, *, restart: bool) -> float | None:
     monkeypatch.setattr(worker_process, "time", SimpleNamespace(monotonic=lambda: 0.0))
     setup = Setup(0, 0, [Faulty] * 3, AutoresetMode.NEXT_STEP, restart, TIMEOUT)
     worker = WorkerProcess(setup, fiber.get_context(), "owner")
-    worker.pending = {0: Pending("step"), 2: Pending("step")}
+    worker.pending = {0: PendingCommand("step"), 2: PendingCommand("step")}
     worker.set_deadline()
     return worker.deadline
 

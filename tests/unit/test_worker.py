@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from fiber._agent import worker as worker_module
-from fiber._agent.worker import FUNCTIONS, Watchdog, Worker
+from fiber._agent.worker import FUNCTIONS, BatchRunner, Watchdog
 from fiber._wire import packet, work
 from patience import PATIENCE
 from unit import pool_tasks as tasks
@@ -65,7 +65,7 @@ class Rig:
     def __init__(self, retryable: tuple[type[BaseException], ...] = ()) -> None:
         self.channel = Channel()
         self.progress = memoryview(bytearray(16)).cast("Q")
-        self.worker = Worker(self.channel, self.progress, retryable)
+        self.worker = BatchRunner(self.channel, self.progress, retryable)
         self._seq = 0
 
     def give(

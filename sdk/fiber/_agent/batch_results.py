@@ -24,7 +24,7 @@ _MANY_BUFFERS = packet.MAX_BUFFERS - work.BUFFERS - 1
 """Buffers above which those of one more value may be too many for a message."""
 
 
-class Sender(Protocol):
+class ResultChannel(Protocol):
     """Sending side of a channel."""
 
     def send(self, payload: bytes, buffers: Sequence[memoryview] = ()) -> None:
@@ -58,7 +58,7 @@ class BatchResults:
 
     def __init__(
         self,
-        channel: Sender,
+        channel: ResultChannel,
         seq: int,
         remaining: Iterator[Any],
         total: int,

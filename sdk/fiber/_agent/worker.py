@@ -26,7 +26,7 @@ from types import FrameType
 from typing import Any
 
 from fiber._agent import child
-from fiber._agent.batch_results import BatchResults, Sender
+from fiber._agent.batch_results import BatchResults, ResultChannel
 from fiber._agent.travelling import encode_error, format_error
 from fiber._hub.remote import Taken, confirm, loads
 from fiber._wire import work
@@ -60,7 +60,7 @@ def run(
             with contextlib.suppress(OSError):  # the agent is gone
                 channel.send(pickle.dumps((work.INIT_FAILED, format_error(error))))
             raise SystemExit(1) from None
-    worker = Worker(channel, child.progress(), retryable)
+    worker = BatchRunner(channel, child.progress(), retryable)
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, worker.interrupt)
     try:
@@ -72,11 +72,14 @@ def run(
     worker.close()
 
 
-class Worker:
+class BatchRunner:
     """Runner of batches.  ``progress``: two shared words, batch and index of the running task."""
 
     def __init__(
-        self, channel: Sender, progress: memoryview, retryable: tuple[type[BaseException], ...] = ()
+        self,
+        channel: ResultChannel,
+        progress: memoryview,
+        retryable: tuple[type[BaseException], ...] = (),
     ) -> None:
         self._channel = channel
         self._progress = progress

@@ -10,7 +10,7 @@ from fiber._agent.interface import Cause, ChildObserver, ChildSpec, ExitReport
 from fiber._backends.remote import RemoteAgent, RemoteChild
 from fiber._engine.placement import Placement
 from fiber._hub.hub import Hub
-from fiber._logs import Output
+from fiber._logs import OutputWriter
 from fiber._transport.link import Link
 from fiber._transport.loop import EventLoop
 
@@ -28,7 +28,7 @@ class AgentSet:
         self,
         loop: EventLoop,
         hub: Hub,
-        output: Output,
+        output: OutputWriter,
         placement: Placement[RemoteAgent, RemoteChild],
         *,
         on_change: Callable[[], None] = lambda: None,

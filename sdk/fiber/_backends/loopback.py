@@ -30,7 +30,7 @@ from fiber._engine.placement import Placement
 from fiber._engine.start_failures import StartFailure, StartFailures
 from fiber._hub.directory import remove_directory
 from fiber._hub.hub import Hub
-from fiber._logs import Output
+from fiber._logs import OutputWriter
 from fiber._transport.authentication import Identity, join_address
 from fiber._transport.credentials import Credentials, make_credentials
 from fiber._transport.link import Keepalive, Link
@@ -74,7 +74,7 @@ class LoopbackBackend:
         self._loop = loop
         self._hub = hub
         self._config = config
-        self._output = Output()
+        self._output = OutputWriter()
         self._failures = StartFailures()
         self._reasons: deque[tuple[str, str]] = deque(maxlen=_REASONS)
         self._gave_up = False

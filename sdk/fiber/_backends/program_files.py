@@ -29,7 +29,7 @@ _LARGEST = 5
 """Entries that an error lists."""
 
 
-class Entry(NamedTuple):
+class FileEntry(NamedTuple):
     """File, folder or link, as it was found."""
 
     path: str
@@ -51,7 +51,7 @@ class Why(enum.Enum):
     UNREADABLE = "unreadable"
 
 
-class LeftOut(NamedTuple):
+class UnsentFile(NamedTuple):
     """File, folder or link that is not sent."""
 
     path: str
@@ -62,13 +62,13 @@ class LeftOut(NamedTuple):
 class Selection(NamedTuple):
     """Files that are sent, by their names in the archive, and files that are left out."""
 
-    files: dict[str, Entry]
-    left_out: tuple[LeftOut, ...]
+    files: dict[str, FileEntry]
+    left_out: tuple[UnsentFile, ...]
 
 
 def select(layout: Layout, *, bounded: bool = True) -> Selection:
     """Return what is sent of the program; ProgramTooLarge if that is too much and ``bounded``."""
-    found: dict[str, Entry] = {}
+    found: dict[str, FileEntry] = {}
     name_of = layout.places.name_of
     walk = _Walk(layout)
     for top in dict.fromkeys((*layout.places, layout.program, *layout.files)):
@@ -81,18 +81,18 @@ def select(layout: Layout, *, bounded: bool = True) -> Selection:
     if bounded:
         _check_size(layout, found)
     if layout.paths.directory:  # whatever of it is sent, somebody will work in it
-        found.setdefault(layout.paths.directory, Entry("", stat.S_IFDIR))
+        found.setdefault(layout.paths.directory, FileEntry("", stat.S_IFDIR))
     sent = {entry.path for entry in found.values()}
     return Selection(found, tuple(left for left in walk.left_out if left.path not in sent))
 
 
-def _check_size(layout: Layout, found: dict[str, Entry]) -> None:
+def _check_size(layout: Layout, found: dict[str, FileEntry]) -> None:
     total = sum(entry.size for entry in found.values())
     if total > LIMIT:
         raise too_large(layout, found, mebibytes(total))
 
 
-def too_large(layout: Layout, found: dict[str, Entry], what: str) -> ProgramTooLarge:
+def too_large(layout: Layout, found: dict[str, FileEntry], what: str) -> ProgramTooLarge:
     """Return the error for a program that has ``what``."""
     sizes: Counter[str] = Counter()
     for entry in found.values():
@@ -127,17 +127,17 @@ class _Walk:
     """Walk over all files of a program."""
 
     def __init__(self, layout: Layout) -> None:
-        self.left_out: list[LeftOut] = []
+        self.left_out: list[UnsentFile] = []
         self._packages = {os.path.dirname(file) for file in layout.files}
         """Folders with modules that the program has imported."""
 
-    def everything_in(self, top: str) -> Iterator[tuple[str, Entry]]:
+    def everything_in(self, top: str) -> Iterator[tuple[str, FileEntry]]:
         """``top`` itself and, if it is a folder, what the rules leave of it."""
         entry = _entry(top)
         if entry is None:
             return
         if not _is_readable(entry):
-            self.left_out.append(LeftOut(top, Why.UNREADABLE, ""))
+            self.left_out.append(UnsentFile(top, Why.UNREADABLE, ""))
             return
         yield top, entry
         if stat.S_ISDIR(entry.mode):
@@ -146,7 +146,7 @@ class _Walk:
 
     def _walk(
         self, folder: str, rules: IgnoreRules, around: _Around
-    ) -> Iterator[tuple[str, Entry]]:
+    ) -> Iterator[tuple[str, FileEntry]]:
         rules = rules.within(folder)
         for found in _found_in(folder):
             path = found.path
@@ -170,18 +170,20 @@ class _Walk:
                 yield from self._walk(path, rules, around.within(real, trusted))
 
     def _objection(
-        self, entry: Entry, real: str, rules: IgnoreRules, around: _Around
-    ) -> LeftOut | None:
+        self, entry: FileEntry, real: str, rules: IgnoreRules, around: _Around
+    ) -> UnsentFile | None:
         """Why the entry of a folder is left out."""
         path, is_folder = entry.path, stat.S_ISDIR(entry.mode)
         ignored = rules.ignores(path, is_folder=is_folder)
         if ignored is not None:
-            return LeftOut(path, Why.IGNORED, ignored)
+            return UnsentFile(path, Why.IGNORED, ignored)
         holds = None if around.trusted else _secret(entry, real)
         leads_out = not _is_inside(real, around.top) and path not in self._packages
         if (holds or leads_out) and not rules.asks_for(path, is_folder=is_folder):
-            return LeftOut(path, Why.SECRET, holds) if holds else LeftOut(path, Why.LINK, real)
-        return None if _is_readable(entry) else LeftOut(path, Why.UNREADABLE, "")
+            return (
+                UnsentFile(path, Why.SECRET, holds) if holds else UnsentFile(path, Why.LINK, real)
+            )
+        return None if _is_readable(entry) else UnsentFile(path, Why.UNREADABLE, "")
 
 
 def _found_in(folder: str) -> list[os.DirEntry[str]]:
@@ -192,7 +194,7 @@ def _found_in(folder: str) -> list[os.DirEntry[str]]:
         return []
 
 
-def _is_readable(entry: Entry) -> bool:
+def _is_readable(entry: FileEntry) -> bool:
     """Tell whether this program can read the file, or list and enter the folder."""
     if entry.target is not None:
         return True
@@ -200,7 +202,7 @@ def _is_readable(entry: Entry) -> bool:
     return os.access(entry.path, needed)
 
 
-def _secret(entry: Entry, real: str) -> str | None:
+def _secret(entry: FileEntry, real: str) -> str | None:
     """Return the kind of secret, if the name of the entry or of its target is that of one."""
     if stat.S_ISDIR(entry.mode):
         names = map(os.path.basename, (entry.path, real))
@@ -212,12 +214,12 @@ def _secret(entry: Entry, real: str) -> str | None:
     return None
 
 
-def _link(path: str, real: str, around: _Around) -> Entry | None:
+def _link(path: str, real: str, around: _Around) -> FileEntry | None:
     """A link as it is, if it stays within the folder, otherwise what it leads to."""
     first, parent = around.folders[0], around.folders[-1]
     inside = all(_is_inside(place, first) for place in (*around.folders, real))
     if inside and os.path.exists(path):
-        return Entry(path, stat.S_IFLNK, target=os.path.relpath(real, parent))
+        return FileEntry(path, stat.S_IFLNK, target=os.path.relpath(real, parent))
     return _entry(path)
 
 
@@ -225,18 +227,18 @@ def _is_inside(path: str, folder: str) -> bool:
     return f"{path}/".startswith(f"{folder.rstrip('/')}/")
 
 
-def _entry(path: str) -> Entry | None:
+def _entry(path: str) -> FileEntry | None:
     """A file or folder; None for anything else, and for what is gone."""
     try:
         found = os.stat(path)
     except OSError:
         return None
     if stat.S_ISDIR(found.st_mode):
-        return Entry(path, stat.S_IFDIR)
+        return FileEntry(path, stat.S_IFDIR)
     if not stat.S_ISREG(found.st_mode):
         return None
     mode = stat.S_IFREG | (found.st_mode & stat.S_IXUSR)
-    return Entry(path, mode, found.st_size, found.st_mtime_ns)
+    return FileEntry(path, mode, found.st_size, found.st_mtime_ns)
 
 
 _FOLDERS = {

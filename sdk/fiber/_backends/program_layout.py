@@ -69,7 +69,7 @@ class Layout(NamedTuple):
     paths: ProgramPaths
 
 
-class _Module(NamedTuple):
+class _ImportedModule(NamedTuple):
     """A module that has been imported."""
 
     file: str
@@ -93,7 +93,7 @@ def find_layout(preparation: Mapping[str, Any], left_out: frozenset[str]) -> Lay
     places = Places(_named(_outermost(f for f in whole if _is_sent(f) and f not in left_out)))
     modules = sorted(_imported(left_out))
     if main is not None:
-        modules.append(_Module(main, main, os.path.basename(main)))
+        modules.append(_ImportedModule(main, main, os.path.basename(main)))
     loose = [module for module in modules if places.place_of(module.file) is None]
     places.update({module.whole: f"{LOOSE}/{module.name}" for module in loose})
     return Layout(
@@ -213,7 +213,7 @@ def _named(paths: Iterable[str]) -> dict[str, str]:
     return names
 
 
-def _imported(left_out: frozenset[str]) -> Iterator[_Module]:
+def _imported(left_out: frozenset[str]) -> Iterator[_ImportedModule]:
     """The modules that are not installed; parts of packages, too."""
     for name, module in list(sys.modules.items()):
         if name in ("__main__", "__mp_main__") or name.partition(".")[0] == "fiber_api":
@@ -224,13 +224,13 @@ def _imported(left_out: frozenset[str]) -> Iterator[_Module]:
         package, *_ = parts = name.split(".")
         top = sys.modules.get(package, module)
         if hasattr(top, "__path__") and getattr(top, "__file__", None):
-            yield _Module(file, next(iter(top.__path__)), package)
+            yield _ImportedModule(file, next(iter(top.__path__)), package)
         elif portion := _portion(top, file, left_out):
-            yield _Module(file, portion, package)
+            yield _ImportedModule(file, portion, package)
         else:  # of a namespace package, whose folder may be anything
             if not hasattr(module, "__path__"):
                 parts.pop()
-            yield _Module(file, file, os.path.join(*parts, os.path.basename(file)))
+            yield _ImportedModule(file, file, os.path.join(*parts, os.path.basename(file)))
 
 
 def _portion(package: Any, file: str, left_out: frozenset[str]) -> str | None:

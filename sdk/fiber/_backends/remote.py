@@ -19,7 +19,7 @@ from typing import Protocol
 
 from fiber._agent.interface import Cause, ChildObserver, ChildSpec, ExitReport
 from fiber._hub.hub import Hub
-from fiber._logs import Output
+from fiber._logs import OutputWriter
 from fiber._transport.link import Link
 from fiber._transport.link_protocol import Frame
 from fiber._transport.loop import EventLoop
@@ -75,7 +75,7 @@ class RemoteAgent:
         link: Link,
         loop: EventLoop,
         hub: Hub,
-        output: Output,
+        output: OutputWriter,
         observer: AgentObserver,
     ) -> None:
         self.host = host
@@ -352,7 +352,7 @@ class RemoteChild:
         elif self._agent is not None and not self._gone:
             self._agent.transmit(message)
 
-    def heard(self, message: messages.LinkMessage, output: Output) -> None:
+    def heard(self, message: messages.LinkMessage, output: OutputWriter) -> None:
         """Something about this child."""
         if isinstance(message, messages.FromChild):
             buffers = [memoryview(buffer) for buffer in message.buffers]

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 from fiber._agent.child import ProgramPaths
 from fiber._backends import program_files
-from fiber._backends.program_files import Entry, LeftOut, Why, select
+from fiber._backends.program_files import FileEntry, UnsentFile, Why, select
 from fiber._backends.program_layout import INCLUDING, Layout, find_layout, main_file
 from fiber._wire.memory_files import Blob
 from fiber.errors import ProgramTooLarge, in_one_line
@@ -29,7 +29,7 @@ _SHOWN = 10
 """Entries that a warning lists."""
 
 
-class Program(NamedTuple):
+class PackedProgram(NamedTuple):
     """The program's files, as they were when they were looked at last."""
 
     archive: Blob
@@ -40,7 +40,7 @@ class Shipping:
     """Files of this program to send.  Any thread may look."""
 
     def __init__(self) -> None:
-        self._latest: tuple[dict[str, Entry], Program] | None = None
+        self._latest: tuple[dict[str, FileEntry], PackedProgram] | None = None
         self._left_out: frozenset[str] = frozenset()
         self._said: set[str] = set()
         """Warnings, and the paths that were in one."""
@@ -50,7 +50,7 @@ class Shipping:
         """True if children can import the main module."""
         return main_file() is not None
 
-    def program(self, preparation: Mapping[str, Any], *, anew: bool) -> Program:
+    def program(self, preparation: Mapping[str, Any], *, anew: bool) -> PackedProgram:
         """The program for children that ``preparation`` is for; ProgramTooLarge.
 
         ``anew``: as its files are now, not as they were for the last child.
@@ -59,7 +59,7 @@ class Shipping:
             self._latest = self._look(preparation)
         return self._latest[1]
 
-    def _look(self, preparation: Mapping[str, Any]) -> tuple[dict[str, Entry], Program]:
+    def _look(self, preparation: Mapping[str, Any]) -> tuple[dict[str, FileEntry], PackedProgram]:
         layout = find_layout(preparation, self._left_out)
         if self.main_is_sent and layout.places.place_of(layout.program) is None:
             self._warn(
@@ -87,9 +87,9 @@ class Shipping:
         archive = Blob(packed.archive)
         if latest is not None and latest[1].archive.digest == archive.digest:
             archive = latest[1].archive  # touched, and the same
-        return files, Program(archive, layout.paths)
+        return files, PackedProgram(archive, layout.paths)
 
-    def _tell(self, layout: Layout, left_out: Iterable[LeftOut]) -> None:
+    def _tell(self, layout: Layout, left_out: Iterable[UnsentFile]) -> None:
         """Say once of each path that a person would not expect it to be left out."""
         news = [left for left in left_out if left.path not in self._said]
         self._said.update(left.path for left in news)
@@ -153,7 +153,7 @@ class Packed(NamedTuple):
     torn: list[str]
 
 
-def pack(layout: Layout, files: dict[str, Entry]) -> Packed:
+def pack(layout: Layout, files: dict[str, FileEntry]) -> Packed:
     """The archive: names in order, no times, no owners.  Reads what is there now."""
     buffer = io.BytesIO()
     torn: list[str] = []
@@ -171,7 +171,7 @@ def pack(layout: Layout, files: dict[str, Entry]) -> Packed:
     return Packed(buffer.getvalue(), torn)
 
 
-def _folders_of(names: dict[str, Entry]) -> list[str]:
+def _folders_of(names: dict[str, FileEntry]) -> list[str]:
     """The folders that must be there first, outer ones before inner ones."""
     folders = {name for name, entry in names.items() if stat.S_ISDIR(entry.mode)}
     for name in names:
@@ -180,7 +180,7 @@ def _folders_of(names: dict[str, Entry]) -> list[str]:
     return sorted(folders, key=os.fsencode)
 
 
-def _append(archive: tarfile.TarFile, name: str, entry: Entry, torn: list[str]) -> int:
+def _append(archive: tarfile.TarFile, name: str, entry: FileEntry, torn: list[str]) -> int:
     """Add a file or link; the bytes that it has."""
     member = _member(name, entry.mode)
     if entry.target is not None:

@@ -30,7 +30,7 @@ from fiber.resources import resources_of
 
 if TYPE_CHECKING:
     from fiber._agent.interface import Backend
-    from fiber._backends.shipping import Program, Shipping
+    from fiber._backends.shipping import PackedProgram, Shipping
 
 _WORTH_SHARING = 1 << 16
 """Bytes of a pickle from which on it is sent once for all processes."""
@@ -121,7 +121,7 @@ class Runtime:
         self.loop.call_soon(owner.begin, made)
         return made
 
-    def _preparation(self, process: Any, *, anew: bool) -> tuple[bytes, Program | None]:
+    def _preparation(self, process: Any, *, anew: bool) -> tuple[bytes, PackedProgram | None]:
         """Return the preparation data of a child, and its files; ``anew`` as in ``Shipping``."""
         data = self._spawn_data(f"process {process.name!r}")
         same_host = self.backend.same_host

@@ -2,23 +2,49 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import time
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from multiprocessing import TimeoutError as WaitedTooLong
 from typing import Any, NamedTuple
 
-from fiber import reduction
+from gymnasium.vector import AutoresetMode
+
+import fiber
+from fiber import config, cpu, reduction
 from fiber._exceptions import add_note, fresh
 from fiber._transport.loop import DOZE
 from fiber.errors import StartError
-from fiber.vector.arrays import Shape, SharedMemory, StepArrays
-from fiber.vector.slot import Note
-from fiber.vector.worker import ATTEMPTS, Answer, Begin, Failure, Hello, Results
-from fiber.vector.worker_process import Ended, Pending, Unreadable, WorkerProcess, WorkerSet
+from fiber.vector.arrays import (
+    ArrayLayout,
+    ArrayMemory,
+    ObservationMode,
+    Spaces,
+    StepArrays,
+    check_mode,
+)
+from fiber.vector.slot import MakeEnv, Note
+from fiber.vector.worker import (
+    ATTEMPTS,
+    Answer,
+    Begin,
+    EnvironmentFailure,
+    Results,
+    Setup,
+    WorkerHello,
+)
+from fiber.vector.worker_process import (
+    Ended,
+    PendingCommand,
+    Unreadable,
+    WorkerGroup,
+    WorkerProcess,
+)
 
-_STEP = Pending("step")
+_STEP = PendingCommand("step")
 
 
 class Dispatcher:
@@ -28,12 +54,12 @@ class Dispatcher:
     cluster ends are in any case, ``disruptions`` times in a row.
     """
 
-    def __init__(self, workers: WorkerSet, *, restart: bool, disruptions: int) -> None:
+    def __init__(self, workers: WorkerGroup, *, restart: bool, disruptions: int) -> None:
         self._workers = workers
         self._worker_of = [worker for worker in workers for _ in worker.numbers]
         self._restart = restart
         self._disruptions = disruptions
-        self._calls: list[_Group] = []
+        self._calls: list[_CommandPart] = []
         """Whose results are awaited."""
         self._ready: deque[int] = deque()
         self._notes: dict[int, Note] = {}
@@ -49,7 +75,7 @@ class Dispatcher:
             self._workers.start(worker)
         self._wait(self._all_there, None)
 
-    def begin(self, shape: Shape, arrays: StepArrays, memory: SharedMemory | None) -> None:
+    def begin(self, shape: ArrayLayout, arrays: StepArrays, memory: ArrayMemory | None) -> None:
         """Give them the arrays: those of this host share them, if they lie in ``memory``."""
         self._shape, self._arrays, self._memory = shape, arrays, memory
         self._begun = True
@@ -95,7 +121,7 @@ class Dispatcher:
         commands = []
         for group in self._groups(numbers):
             told = {
-                row: Pending("reset", seeds[position], options[position])
+                row: PendingCommand("reset", seeds[position], options[position])
                 for row, position in zip(group.each(), group.positions, strict=True)
             }
             commands.append((group, told, _reset_command(group.worker, group.rows, told)))
@@ -111,7 +137,7 @@ class Dispatcher:
         commands = []
         for group in groups:
             mine = [arguments[position] for position in group.positions]
-            no_steps: dict[int, Pending] = {}
+            no_steps: dict[int, PendingCommand] = {}
             data = _encoded(group.worker, "call", group.rows, method, mine)
             commands.append((group, no_steps, data))
         for group in groups:
@@ -177,10 +203,10 @@ class Dispatcher:
 
     # Telling
 
-    def _groups(self, numbers: Sequence[int] | None) -> list[_Group]:
+    def _groups(self, numbers: Sequence[int] | None) -> list[_CommandPart]:
         """A command's parts, by worker; raises what became of one that is there no more."""
         if numbers is None:
-            groups = [_Group(worker, None, worker.numbers) for worker in self._workers]
+            groups = [_CommandPart(worker, None, worker.numbers) for worker in self._workers]
         else:
             by_name: dict[str, tuple[WorkerProcess, list[int], list[int]]] = {}
             for position, number in enumerate(numbers):
@@ -188,13 +214,15 @@ class Dispatcher:
                 _, rows, positions = by_name.setdefault(worker.name, (worker, [], []))
                 rows.append(number - worker.setup.first)
                 positions.append(position)
-            groups = [_Group(*group) for group in by_name.values()]
+            groups = [_CommandPart(*group) for group in by_name.values()]
         for group in groups:
             if group.worker.error is not None:
                 raise fresh(group.worker.error)
         return groups
 
-    def _tell(self, commands: Iterable[tuple[_Group, dict[int, Pending], bytes]]) -> None:
+    def _tell(
+        self, commands: Iterable[tuple[_CommandPart, dict[int, PendingCommand], bytes]]
+    ) -> None:
         for group, told, data in commands:
             group.worker.pending.update(told)
             # One that is being started anew is told once it has begun.
@@ -239,11 +267,11 @@ class Dispatcher:
         match message:
             case Ended():
                 self._mourn(worker)
-            case Hello():
+            case WorkerHello():
                 worker.hello = message
                 if self._begun:
                     self._stand_in(worker)
-            case Failure():
+            case EnvironmentFailure():
                 self._lose(worker, self._told(worker, message)[1])
             case Unreadable():
                 self._blame(worker, message.error)
@@ -287,7 +315,7 @@ class Dispatcher:
         worker.give_up()  # what it has yet to say of its other environments, too
         self._failures.append((worker.setup.first, error))
 
-    def _told(self, worker: WorkerProcess, failure: Failure) -> tuple[int, Exception]:
+    def _told(self, worker: WorkerProcess, failure: EnvironmentFailure) -> tuple[int, Exception]:
         number = worker.setup.first + failure.row
         return number, failure.exception(self.name(number))
 
@@ -397,7 +425,7 @@ def _encoded(
 
 
 def _reset_command(
-    worker: WorkerProcess, rows: Sequence[int] | None, told: dict[int, Pending]
+    worker: WorkerProcess, rows: Sequence[int] | None, told: dict[int, PendingCommand]
 ) -> bytes:
     seeds = [each.seed for each in told.values()]
     return _encoded(worker, "reset", rows, seeds, [each.options for each in told.values()])
@@ -410,7 +438,7 @@ def _only_reports_losses(message: Answer | Results) -> bool:
     return all(note.lost for note in message.notes) and len(message.notes) == len(message.rows)
 
 
-class _Group(NamedTuple):
+class _CommandPart(NamedTuple):
     """Part of a command for one worker."""
 
     worker: WorkerProcess
@@ -421,3 +449,117 @@ class _Group(NamedTuple):
     def each(self) -> Sequence[int]:
         """Return the rows one by one."""
         return range(len(self.worker.numbers)) if self.rows is None else self.rows
+
+
+class SubEnvironments:
+    """Workers with their environments, the arrays of a step, and the spaces of both."""
+
+    def __init__(
+        self,
+        env_fns: Sequence[MakeEnv],
+        *,
+        owner: str,
+        num_workers: int | None,
+        shared_memory: bool,
+        context: str | None,
+        observation_mode: ObservationMode,
+        autoreset: AutoresetMode,
+        on_error: str,
+        timeout: float | None,
+    ) -> None:
+        self._owner = os.getpid()
+        if not env_fns:
+            raise ValueError("a vector environment has at least one environment: env_fns is empty")
+        if on_error not in ("raise", "restart"):
+            raise ValueError(f"on_error is 'raise' or 'restart', not {on_error!r}")
+        if timeout is not None and timeout <= 0:
+            raise ValueError(f"timeout is a number of seconds above 0, not {timeout!r}")
+        if num_workers is not None and num_workers < 1:
+            raise ValueError(f"num_workers is at least 1, not {num_workers}")
+        check_mode(observation_mode)
+        count = len(env_fns)
+        wanted = cpu.cpu_count() if num_workers is None else num_workers
+        setups = [
+            Setup(index, rows.start, env_fns[rows], autoreset, on_error == "restart", timeout)
+            for index, rows in enumerate(_divided(count, min(wanted, count)))
+        ]
+        chosen = fiber.get_context(context)
+        workers = [WorkerProcess(setup, chosen, owner) for setup in setups]
+        self.dispatcher = Dispatcher(
+            WorkerGroup(workers),
+            restart=on_error == "restart",
+            disruptions=config.current().disruptions,
+        )
+        try:
+            self.dispatcher.start()
+            hellos = [worker.hello for worker in workers if worker.hello is not None]
+            self.metadata = hellos[0].metadata
+            self.render_mode = hellos[0].render_mode
+            self.spaces = Spaces.of(
+                [pair for hello in hellos for pair in hello.spaces],
+                observation_mode,
+                self.dispatcher.name,
+            )
+            shape = ArrayLayout(
+                self.spaces.single_observation_space,
+                self.spaces.single_action_space,
+                count,
+                len(setups),
+            )
+            memory = ArrayMemory.allocate(shape.size()) if shared_memory else None
+            self.arrays = (
+                StepArrays.of_memory(shape, memory.view) if memory else StepArrays.private(shape)
+            )
+            self.dispatcher.begin(shape, self.arrays, memory)
+        except BaseException:
+            self.close(0)
+            raise
+
+    def step(
+        self,
+        numbers: Sequence[int] | None,
+        actions: Any,
+        split: Callable[[Any], list[Any]],
+        *,
+        together: bool,
+    ) -> None:
+        """Begin to step some environments, or all, with a batch of actions for them.
+
+        ``split`` makes a list of the batch.  ``together``: the caller waits for all of them.
+        """
+        count = len(self.arrays.rewards) if numbers is None else len(numbers)
+        columns = self.arrays.actions
+        if columns.fits(actions, count):
+            columns.fill(slice(None) if numbers is None else numbers, actions)
+            self.dispatcher.step(numbers, None, together=together)
+            return
+        chosen = split(actions)
+        if len(chosen) != count:
+            raise ValueError(
+                f"actions for {count} environments are needed, one for each, not {len(chosen)}"
+            )
+        self.dispatcher.step(numbers, chosen, together=together)
+
+    def close(self, timeout: float | None) -> None:
+        """End the workers; kill those that have not ended when ``timeout`` is over."""
+        if os.getpid() == self._owner:  # else nothing of the workers is here to end
+            self.dispatcher.close(timeout)
+
+    def discard(self) -> None:
+        """End the workers at once, from a finalizer."""
+        with contextlib.suppress(RuntimeError):  # Fiber's own thread cannot wait for their ends
+            self.close(0)
+
+    def check_owner(self) -> None:
+        """RuntimeError in another process than that which made them."""
+        if os.getpid() != self._owner:
+            raise RuntimeError(
+                f"this vector environment belongs to process {self._owner}: a copy of it that came "
+                "here by a fork has no workers; make one in this process"
+            )
+
+
+def _divided(count: int, parts: int) -> Iterator[slice]:
+    """So many pieces, as equal as can be, of so many environments."""
+    for part in range(parts):
+        yield slice(count * part // parts, count * (part + 1) // parts)

@@ -24,7 +24,7 @@ from fiber._agent.travelling import encode_error
 from fiber._exceptions import add_note
 from fiber._hub import client
 from fiber.connection import Connection
-from fiber.vector.arrays import Packed, Shape, SharedMemory, StepArrays, in_band
+from fiber.vector.arrays import ArrayLayout, ArrayMemory, Packed, StepArrays, in_band
 from fiber.vector.slot import MakeEnv, Note, Slot
 
 REPORT_AFTER, REPORT_AFTER_ELSEWHERE = 200e-6, 2e-3
@@ -53,7 +53,7 @@ class Setup(NamedTuple):
     """Seconds for the making, a step or a reset of one environment."""
 
 
-class Hello(NamedTuple):
+class WorkerHello(NamedTuple):
     """First message of a worker."""
 
     host: str
@@ -64,11 +64,11 @@ class Hello(NamedTuple):
 
 
 class Begin(NamedTuple):
-    """First message to a worker, after its ``Hello``."""
+    """First message to a worker, after its ``WorkerHello``."""
 
-    shape: Shape
+    shape: ArrayLayout
     """Shape for the worker's environments, or for all of them if there is ``memory``."""
-    memory: SharedMemory | None
+    memory: ArrayMemory | None
     last: Packed | None = None
     """Last results of the worker that this one replaces."""
     lost: str | None = None
@@ -83,7 +83,7 @@ class Answer(NamedTuple):
     """Rows of the finished environments; None means all of the worker."""
     packed: Packed | None
     notes: Sequence[Note]
-    failures: Sequence[Failure]
+    failures: Sequence[EnvironmentFailure]
     """Failures of environments that are not among ``rows``."""
 
 
@@ -92,7 +92,7 @@ class Results(NamedTuple):
 
     generation: int
     values: list[Any]
-    failures: Sequence[Failure]
+    failures: Sequence[EnvironmentFailure]
 
 
 def serve(connection: Connection, setup: Setup) -> None:
@@ -100,7 +100,7 @@ def serve(connection: Connection, setup: Setup) -> None:
     slots: list[Slot] = []
     try:
         if _make_all(connection, setup, slots):
-            Worker(connection, setup, slots, connection.recv()).run()
+            EnvironmentWorker(connection, setup, slots, connection.recv()).run()
     except (EOFError, BrokenPipeError):
         pass  # the learner has ended, or has closed the environments
     finally:
@@ -121,20 +121,22 @@ def _make_all(connection: Connection, setup: Setup, slots: list[Slot]) -> bool:
                 _check_that_it_is_new(slots[-1], made)
                 spaces.append((slots[row].env.observation_space, slots[row].env.action_space))
         except Exception as error:
-            connection.send(Failure.of(row, "the making", error))
+            connection.send(EnvironmentFailure.of(row, "the making", error))
             return False
     env = slots[0].env
     metadata, mode = in_band(dict(env.metadata)), env.render_mode
     try:
-        connection.send(Hello(client.host(), metadata, mode, in_band(spaces)))
+        connection.send(WorkerHello(client.host(), metadata, mode, in_band(spaces)))
     except Exception as error:  # pickling runs code of the environments
         row = next((row for row, pair in enumerate(spaces) if not _pickles(pair)), 0)
-        connection.send(Failure.of(row, "spaces or metadata that cannot be pickled", error))
+        connection.send(
+            EnvironmentFailure.of(row, "spaces or metadata that cannot be pickled", error)
+        )
         return False
     return True
 
 
-class Worker:
+class EnvironmentWorker:
     """Loop that carries out commands until the connection ends."""
 
     def __init__(
@@ -229,14 +231,14 @@ class Worker:
             try:
                 values[row] = getattr(self._slots[row], method)(*mine)
             except Exception as error:
-                failures.append(Failure.of(row, "a call", error))
+                failures.append(EnvironmentFailure.of(row, "a call", error))
         at_work[worker] = 0
         try:
             self._tell(Results(generation, in_band(list(values.values())), failures))
         except Exception:  # of any class: an answer cannot be pickled
             for row, refusal in _refused(values.items()):
                 del values[row]
-                failures.append(Failure.of(row, _UNPICKLABLE, refusal))
+                failures.append(EnvironmentFailure.of(row, _UNPICKLABLE, refusal))
             self._tell(Results(generation, in_band(list(values.values())), failures))
 
     # Parts of all operations
@@ -307,7 +309,7 @@ class Worker:
             else:
                 report.add(row, note)
                 return
-        report.failures.append(Failure.of(row, failed or doing, error))
+        report.failures.append(EnvironmentFailure.of(row, failed or doing, error))
 
     def _send(
         self,
@@ -350,7 +352,7 @@ class _Report:
         self.generation = generation
         self.rows: list[int] = []
         self.notes: list[Note] = []
-        self.failures: list[Failure] = []
+        self.failures: list[EnvironmentFailure] = []
         self.due = 0.0
 
     def add(self, row: int, note: Note | None) -> None:
@@ -410,7 +412,7 @@ ATTEMPTS = 3
 """Number of times in a row that an environment is made anew without having done anything."""
 
 
-class Failure(NamedTuple):
+class EnvironmentFailure(NamedTuple):
     """Error that one environment raised."""
 
     row: int
@@ -419,7 +421,7 @@ class Failure(NamedTuple):
     """The pickled exception."""
 
     @classmethod
-    def of(cls, row: int, doing: str, error: BaseException) -> Failure:
+    def of(cls, row: int, doing: str, error: BaseException) -> EnvironmentFailure:
         """Return the failure of the environment in ``row``.  Called in its worker."""
         return cls(row, doing, encode_error(error))
 

@@ -18,7 +18,7 @@ from fiber.errors import UnpicklableError, WorkerDied, block
 from fiber.process import Process
 from fiber.resources import largest, resources_of, with_resources
 from fiber.vector.arrays import StepArrays
-from fiber.vector.worker import Hello, Setup, serve
+from fiber.vector.worker import Setup, WorkerHello, serve
 
 NEWS = 2.0
 """Seconds that the news of a process's end may take after that of its connection."""
@@ -32,7 +32,7 @@ end, the making of the new one, and the step of that.
 """
 
 
-class Pending(NamedTuple):
+class PendingCommand(NamedTuple):
     """Command that an environment has not answered yet."""
 
     operation: str
@@ -55,10 +55,10 @@ class WorkerProcess:
         """Numbers of the worker's environments."""
         self._context = context
         self._wishes = largest(map(resources_of, setup.makes))
-        self.hello: Hello | None = None
+        self.hello: WorkerHello | None = None
         self.generation = 0
         """Number of the present generation of commands.  Answers to earlier ones are ignored."""
-        self.pending: dict[int, Pending] = {}
+        self.pending: dict[int, PendingCommand] = {}
         """Unanswered commands by row."""
         self.results: list[Any] | None = None
         """Results of the last call of methods; None while they are awaited."""
@@ -212,7 +212,7 @@ class Unreadable(NamedTuple):
     error: Exception
 
 
-class WorkerSet:
+class WorkerGroup:
     """Set of workers that are started and listened to."""
 
     def __init__(self, workers: Sequence[WorkerProcess]) -> None:

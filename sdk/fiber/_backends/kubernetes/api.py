@@ -1,8 +1,8 @@
 """Client of the Kubernetes API for a program. JSON documents go in and come out.
 
-``Session`` is the only importer of the package ``kubernetes``, and imports it at the first
+``ApiSession`` is the only importer of the package ``kubernetes``, and imports it at the first
 connection. The package does the logins: kubeconfigs with their plugins, accounts of pods, tokens
-that expire. ``Api`` adds the calls, and ``Resource`` the paths of the kinds of objects that a
+that expire. ``Api`` adds the calls, and ``ApiResource`` the paths of the kinds of objects that a
 program uses.
 
 Errors::
@@ -100,7 +100,7 @@ class Transient(ApiError):
         self.retry_after = retry_after
 
 
-class Unreachable(Transient):
+class ServerUnreachable(Transient):
     """No answer came, or none of an API server."""
 
 
@@ -116,7 +116,7 @@ _KINDS: dict[int, type[ApiError]] = {
     401: Unauthorized,
     403: Forbidden,
     404: NotFound,
-    408: Unreachable,
+    408: ServerUnreachable,
     409: Conflict,
     410: Expired,
     429: TooManyRequests,
@@ -133,7 +133,7 @@ def document_of(status: int, headers: Mapping[str, str], data: bytes) -> Body:
         if isinstance(body, dict):
             return body
         # Not shown: it may be half a Secret.
-        raise Unreachable(f"the answer is no JSON object ({len(data)} bytes)", status=status)
+        raise ServerUnreachable(f"the answer is no JSON object ({len(data)} bytes)", status=status)
     found = body if isinstance(body, dict) else {}
     text = str(found.get("message") or "") or data[:200].decode(errors="replace").strip()
     raise error_of(status, headers, found, text)
@@ -152,7 +152,7 @@ def error_of(status: int, headers: Mapping[str, str], body: Body, text: str = ""
 def _kind_of(status: int) -> type[ApiError]:
     if status >= 500:
         return ServerError
-    return _KINDS.get(status, Invalid) if status >= 400 else Unreachable
+    return _KINDS.get(status, Invalid) if status >= 400 else ServerUnreachable
 
 
 def _retry_after(headers: Mapping[str, str], body: Body) -> float:
@@ -187,7 +187,7 @@ class Api:
     A call that was tried again, or ends in Transient, may have been carried out before.
     """
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: ApiSession) -> None:
         self._session = session
         self.trouble: str | None = None
         """Why the newest call is tried again, or was given up; None once one succeeds."""
@@ -199,7 +199,7 @@ class Api:
         A pod without KUBECONFIG uses its account.  This makes no call.  ConfigError if there is
         neither.
         """
-        return cls(Session(Login.find(context)))
+        return cls(ApiSession(Login.find(context)))
 
     @property
     def namespace(self) -> str:
@@ -222,13 +222,13 @@ class Api:
 
     def get(self, path: str, **how: Unpack[_How]) -> Body:
         """The object at ``path``."""
-        return self._call(Request("GET", path), **how)
+        return self._call(ApiRequest("GET", path), **how)
 
     def list(
         self, path: str, selector: Mapping[str, str] | None = None, **how: Unpack[_How]
     ) -> Body:
         """The list at ``path``.  ``selector`` may have labelSelector and fieldSelector."""
-        return self._call(Request("GET", path, selector or {}), **how)
+        return self._call(ApiRequest("GET", path, selector or {}), **how)
 
     def create(self, path: str, body: Body, *, strict: bool = False, **how: Unpack[_How]) -> Body:
         """Add ``body`` to the collection ``path``.
@@ -236,24 +236,26 @@ class Api:
         ``strict``: Invalid for fields that the API server does not know, which it else drops.
         """
         query = {**_AS_SDK, "fieldValidation": "Strict"} if strict else _AS_SDK
-        return self._call(Request("POST", path, query, body), **how)
+        return self._call(ApiRequest("POST", path, query, body), **how)
 
     def apply(self, path: str, body: Body, **how: Unpack[_How]) -> Body:
         """Server-side apply: what the last one had and ``body`` has not is removed."""
         kind = "application/apply-patch+yaml"
-        return self._call(Request("PATCH", path, {**_AS_SDK, "force": "true"}, body, kind), **how)
+        return self._call(
+            ApiRequest("PATCH", path, {**_AS_SDK, "force": "true"}, body, kind), **how
+        )
 
     def merge_patch(self, path: str, patch: Body, **how: Unpack[_How]) -> Body:
         """None removes a field, a list replaces the list."""
         kind = "application/merge-patch+json"
-        return self._call(Request("PATCH", path, _AS_SDK, patch, kind), **how)
+        return self._call(ApiRequest("PATCH", path, _AS_SDK, patch, kind), **how)
 
     def delete(self, path: str, *, uid: str | None = None, **how: Unpack[_How]) -> Body:
         """Delete the object and what it owns; Conflict if it is not the one with this ``uid``."""
         options: Body = {"propagationPolicy": "Background"}
         if uid is not None:
             options["preconditions"] = {"uid": uid}
-        return self._call(Request("DELETE", path, {}, options), **how)
+        return self._call(ApiRequest("DELETE", path, {}, options), **how)
 
     def watch(self, path: str, selector: Mapping[str, str], resource_version: str) -> Watch:
         """Watch the changes at ``path`` after ``resource_version``."""
@@ -264,11 +266,11 @@ class Api:
             "allowWatchBookmarks": "true",
             "timeoutSeconds": f"{_WATCH_SECONDS:.0f}",
         }
-        return Watch(self._session, Request("GET", path, query))
+        return Watch(self._session, ApiRequest("GET", path, query))
 
     def _call(
         self,
-        request: Request,
+        request: ApiRequest,
         *,
         timeout: float = TIMEOUT,
         cancel: threading.Event | None = None,
@@ -301,7 +303,7 @@ class Watch:
     Any end is one: whoever wants more asks for another watch from where this one came to.
     """
 
-    def __init__(self, session: Session, request: Request) -> None:
+    def __init__(self, session: ApiSession, request: ApiRequest) -> None:
         self._session = session
         self._request = request
         self._lock = threading.Lock()
@@ -319,7 +321,7 @@ class Watch:
                 _document(response)
             if not stopped:
                 yield from self._events(response)
-        except Unreachable:
+        except ServerUnreachable:
             if not self._stopped:
                 raise
         finally:
@@ -333,7 +335,7 @@ class Watch:
                 event = json.loads(line)
                 kind, found = event["type"], event["object"]
             except (ValueError, RecursionError, KeyError, TypeError):
-                raise Unreachable(f"an event of {len(line)} bytes is no JSON") from None
+                raise ServerUnreachable(f"an event of {len(line)} bytes is no JSON") from None
             if kind == "ERROR":
                 raise error_of(int(found.get("code") or 500), {}, found)
             yield {"type": kind, "object": found}
@@ -367,7 +369,7 @@ _ACCOUNT = "/var/run/secrets/kubernetes.io/serviceaccount"
 _KUBECONFIG = "~/.kube/config"
 
 
-class Request(NamedTuple):
+class ApiRequest(NamedTuple):
     """Request to the API server."""
 
     method: str
@@ -377,7 +379,7 @@ class Request(NamedTuple):
     content_type: str = "application/json"
 
 
-class Session:
+class ApiSession:
     """Session with an API server.  Its login is renewed when it expires.  Any thread may use it."""
 
     def __init__(self, login: Login) -> None:
@@ -394,7 +396,7 @@ class Session:
         """Close the connections; one that is in use is closed after that."""
         self._client.close()
 
-    def send(self, request: Request, read_timeout: float) -> BaseHTTPResponse:
+    def send(self, request: ApiRequest, read_timeout: float) -> BaseHTTPResponse:
         """The response, whatever its status, with the body unread."""
         client = self._client
         response = self._send_by(client, request, read_timeout)
@@ -411,7 +413,7 @@ class Session:
         return self._send_by(self._client, request, read_timeout)
 
     def _send_by(
-        self, client: ApiClient, request: Request, read_timeout: float
+        self, client: ApiClient, request: ApiRequest, read_timeout: float
     ) -> BaseHTTPResponse:
         with self._lock, _login_errors():  # it may run a plugin that logs in: one is enough
             method, url, headers, _, _ = client.param_serialize(
@@ -439,9 +441,9 @@ def network_errors() -> Iterator[None]:
     try:
         yield
     except ApiException as error:  # TLS alone: statuses are read here
-        raise Unreachable(str(error.reason)) from error
+        raise ServerUnreachable(str(error.reason)) from error
     except (HTTPError, OSError) as error:
-        raise Unreachable(str(error) or type(error).__name__) from error
+        raise ServerUnreachable(str(error) or type(error).__name__) from error
 
 
 @contextlib.contextmanager
@@ -571,7 +573,7 @@ def _package() -> Any:
     return kubernetes
 
 
-class Resource(NamedTuple):
+class ApiResource(NamedTuple):
     """A kind of object."""
 
     api_version: str
@@ -585,9 +587,9 @@ class Resource(NamedTuple):
         return "/".join(filter(None, (group, self.api_version, scope, self.plural, name)))
 
 
-POOLS = Resource(names.API_VERSION, names.KIND, names.PLURAL)
-PODS = Resource("v1", "Pod", "pods")
-NODES = Resource("v1", "Node", "nodes")
-CLAIMS = Resource("v1", "PersistentVolumeClaim", "persistentvolumeclaims")
-SECRETS = Resource("v1", "Secret", "secrets")
-LEASES = Resource("coordination.k8s.io/v1", "Lease", "leases")
+POOLS = ApiResource(names.API_VERSION, names.KIND, names.PLURAL)
+PODS = ApiResource("v1", "Pod", "pods")
+NODES = ApiResource("v1", "Node", "nodes")
+CLAIMS = ApiResource("v1", "PersistentVolumeClaim", "persistentvolumeclaims")
+SECRETS = ApiResource("v1", "Secret", "secrets")
+LEASES = ApiResource("coordination.k8s.io/v1", "Lease", "leases")

@@ -43,7 +43,7 @@ LOST = ("Deleted", "Replaced")
 
 
 @dataclass(frozen=True)
-class Master:
+class PoolMaster:
     """Master as ``spec.master`` describes it: this program."""
 
     host: str
@@ -76,7 +76,7 @@ class AttachedPool:
     """FiberPool on the side of its master.  Calls block and raise ``ApiError``."""
 
     def __init__(
-        self, api: Api, found: Body, master: Master, epoch: int, *, kept_by_others: bool = False
+        self, api: Api, found: Body, master: PoolMaster, epoch: int, *, kept_by_others: bool = False
     ) -> None:
         self._api = api
         self.kept_by_others = kept_by_others
@@ -302,7 +302,7 @@ class OwnPool:
         namespace: str,
         body: Body,
         credentials: MasterCredentials,
-        master: Master,
+        master: PoolMaster,
         owner: Body | None,
     ) -> None:
         self._api = api
@@ -448,7 +448,7 @@ def read_pool_key(
 class WarmPool:
     """Pool of another owner, from before this program is its master until after that."""
 
-    def __init__(self, api: Api, namespace: str, name: str, master: Master) -> None:
+    def __init__(self, api: Api, namespace: str, name: str, master: PoolMaster) -> None:
         self._api = api
         self._master = master
         self._attached: AttachedPool | None = None

@@ -18,14 +18,14 @@ from fiber._backends.agent_set import AgentSet
 from fiber._backends.kubernetes.api import LEASES, Api, ApiError, Body, Forbidden, NotFound
 from fiber._backends.kubernetes.attached_pool import LOST
 from fiber._backends.kubernetes.fiber_pool import FiberPoolClient
-from fiber._backends.kubernetes.problems import PoolName, Way, node_of, pod_end
-from fiber._backends.kubernetes.program import ListenerObserver, PreparedPool, Program
-from fiber._backends.kubernetes.template import Shape
-from fiber._backends.kubernetes.waiting import Preparation, Waiting
+from fiber._backends.kubernetes.problems import AgentRoute, PoolName, node_of, pod_end
+from fiber._backends.kubernetes.provisioner import ListenerObserver, PoolProvisioner, PreparedPool
+from fiber._backends.kubernetes.template import PodShape
+from fiber._backends.kubernetes.waiting import Preparation, WaitingChildren
 from fiber._backends.remote import RemoteAgent, RemoteChild
 from fiber._engine.placement import Demand, Placement
 from fiber._hub.hub import Hub
-from fiber._logs import Output
+from fiber._logs import OutputWriter
 from fiber._transport.authentication import Identity
 from fiber._transport.link import Link
 from fiber._transport.loop import Loop, LoopTimer
@@ -48,10 +48,10 @@ class KubernetesBackend:
         self._loop = loop
         self._hub = hub
         self._config = config
-        self._output = Output()
-        self._shape = Shape.of(config)
-        self._program = Program(config)
-        self._pods: dict[tuple[Shape | str, int], Pods] = {}
+        self._output = OutputWriter()
+        self._shape = PodShape.of(config)
+        self._program = PoolProvisioner(config)
+        self._pods: dict[tuple[PodShape | str, int], Pods] = {}
         """Pods by their shape or pool, and by the number of such pods before them."""
         self._closing = False
 
@@ -61,7 +61,7 @@ class KubernetesBackend:
         key = pool or self._shape.with_resources(spec.resources)
         return self._find(key).agents.child(spec, observer)
 
-    def _find(self, key: Shape | str) -> Pods:
+    def _find(self, key: PodShape | str) -> Pods:
         """Return the pods in use, or new ones.  There is no lock: a finalizer may call this too."""
         before = 0
         while True:
@@ -74,7 +74,7 @@ class KubernetesBackend:
                 return pods
             before += 1
 
-    def _make(self, key: Shape | str) -> Pods:
+    def _make(self, key: PodShape | str) -> Pods:
         make = partial(Pods, self._loop, self._hub, self._output, self._config, self._program.api)
         if isinstance(key, str):
             return make(partial(self._program.prepare_warm, key, self._loop))
@@ -115,7 +115,7 @@ class Pods:
         self,
         loop: Loop,
         hub: Hub,
-        output: Output,
+        output: OutputWriter,
         config: Config,
         api: Api,
         prepare: Callable[[ListenerObserver, threading.Event], PreparedPool],
@@ -135,7 +135,7 @@ class Pods:
         self.agents = AgentSet(
             loop, hub, output, self._placement, on_change=self._changed, on_lost=self._lost
         )
-        self._waiting = Waiting(
+        self._waiting = WaitingChildren(
             self.agents, output, api, config.pod_timeout, on_begin=self._warn_anew
         )
         self.over = False
@@ -359,7 +359,7 @@ class Pods:
         self._waiting.attached = True
         if (prepared := self._prepared) is not None:
             prepared.listener.epoch = epoch
-            self._waiting.way = Way(prepared.address, prepared.attachment.displaced)
+            self._waiting.way = AgentRoute(prepared.address, prepared.attachment.displaced)
 
     def on_lease_expired(self) -> None:
         """Have the agents dial the pool's Service, which leads to its master of the moment."""

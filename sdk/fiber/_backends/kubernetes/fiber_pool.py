@@ -45,7 +45,7 @@ _RENEW, _WATCH = "renew the Lease of", "watch"
 """Actions that may fail, in words that the name of the pool follows."""
 
 
-class Attachment(Protocol):
+class AttachablePool(Protocol):
     """Way in which a pool gets this program as its master, and in which that ends."""
 
     name: str
@@ -66,7 +66,7 @@ class Attachment(Protocol):
         """Undo it, whether or not ``attach`` succeeded; ``ApiError``."""
 
 
-class Observer(Protocol):
+class PoolObserver(Protocol):
     """Observer of a FiberPool.  Its methods run on the loop's thread."""
 
     def connected(self) -> int:
@@ -99,7 +99,9 @@ class FiberPoolClient:
     ``close``.  Any thread may call them.
     """
 
-    def __init__(self, api: Api, loop: Loop, attachment: Attachment, observer: Observer) -> None:
+    def __init__(
+        self, api: Api, loop: Loop, attachment: AttachablePool, observer: PoolObserver
+    ) -> None:
         self._api = api
         self._loop = loop
         self._attachment = attachment

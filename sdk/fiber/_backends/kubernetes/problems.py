@@ -21,10 +21,10 @@ from fiber._backends.kubernetes.api import (
     Invalid,
     NotFound,
     ServerError,
+    ServerUnreachable,
     TooManyRequests,
     Transient,
     Unauthorized,
-    Unreachable,
 )
 from fiber._transport.loop import Loop
 from fiber.errors import FiberPoolError
@@ -52,7 +52,7 @@ class PoolName(NamedTuple):
         )
 
 
-class Way(NamedTuple):
+class AgentRoute(NamedTuple):
     """Way of agents to this program."""
 
     address: str
@@ -133,7 +133,9 @@ def failure(pool: PoolName, status: Status, joined: int) -> FiberPoolError | Non
     return None
 
 
-def overdue(pool: PoolName, status: Status, waited: float, now: float, way: Way) -> FiberPoolError:
+def overdue(
+    pool: PoolName, status: Status, waited: float, now: float, way: AgentRoute
+) -> FiberPoolError:
     """No worker came in time: what is known of why.  ``now`` is in unix seconds."""
     worst = next(_problems(status), None)
     why = f"{way.advice}." if running(status) else ""
@@ -147,7 +149,7 @@ def overdue(pool: PoolName, status: Status, waited: float, now: float, way: Way)
     )
 
 
-def unreachable(pool: PoolName, status: Status, waited: float, way: Way) -> FiberPoolError:
+def unreachable(pool: PoolName, status: Status, waited: float, way: AgentRoute) -> FiberPoolError:
     """Return the error for pods that run and whose agents do not arrive."""
     number = running(status)
     pods = f"its {number} running pods" if number != 1 else "its running pod"
@@ -460,7 +462,7 @@ class Reporter:
 
     def answered(self) -> None:
         """The API server is well: if it fails again that is news."""
-        kinds = {kind.__name__ for kind in (Unreachable, ServerError, TooManyRequests)}
+        kinds = {kind.__name__ for kind in (ServerUnreachable, ServerError, TooManyRequests)}
         self._warned -= {*kinds, _EXPIRED}
 
     def warn_anew(self) -> None:

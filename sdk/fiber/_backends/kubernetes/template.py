@@ -43,7 +43,7 @@ _AGENT = ("-m", "fiber.agent")
 
 
 def pod_template(
-    shape: Shape, own_pod: Mapping[str, Any] | None, container: str, python: str = "python"
+    shape: PodShape, own_pod: Mapping[str, Any] | None, container: str, python: str = "python"
 ) -> Document:
     """The template of a shape's pods.
 
@@ -80,7 +80,7 @@ def _workers(template: Document) -> Iterator[Document]:
             yield container
 
 
-def _ask_for(worker: Document, shape: Shape) -> None:
+def _ask_for(worker: Document, shape: PodShape) -> None:
     """Guarantee what functions wish for each of the pod's processes: requests and limits alike."""
     wishes, processes, requests = shape.resources, shape.processes_per_pod, {}
     if wishes.cpu is not None:
@@ -95,7 +95,7 @@ def _ask_for(worker: Document, shape: Shape) -> None:
         worker["resources"] = {"limits": limits, **({"requests": requests} if requests else {})}
 
 
-def _request_the_rest(worker: Document, shape: Shape) -> None:
+def _request_the_rest(worker: Document, shape: PodShape) -> None:
     """Request what the configuration says, of what neither a function nor the template speaks."""
     resources = worker.get("resources") or {}
     memory = shape.memory_request * shape.processes_per_pod + (shape.shm or 0)
@@ -284,7 +284,7 @@ def fiber_pool_body(name: str, template: Mapping[str, Any], config: Config) -> D
 
 
 @dataclass(frozen=True, slots=True)
-class Shape:
+class PodShape:
     """All that decides what a pod is like.  Equal shapes are served by one FiberPool."""
 
     image: str | None = None
@@ -302,7 +302,7 @@ class Shape:
     """MiB of memory at /dev/shm; None: what a container has by itself."""
 
     @classmethod
-    def of(cls, config: Config) -> Shape:
+    def of(cls, config: Config) -> PodShape:
         """The shape of a function without wishes.  Reads the template's file: a ConfigError names
         it where that cannot be.
         """
@@ -325,7 +325,7 @@ class Shape:
             config.shm,
         )
 
-    def with_resources(self, resources: Resources) -> Shape:
+    def with_resources(self, resources: Resources) -> PodShape:
         """The same for a function with these wishes, which win over those that are there."""
         return replace(self, resources=merged(self.resources, resources))
 
@@ -417,7 +417,7 @@ def program_name(path: str | None) -> str:
     return _label(stem if stem not in ("main", "__main__") else os.path.basename(folder))
 
 
-def pool_name(program: str, shape: Shape, suffix: str) -> str:
+def pool_name(program: str, shape: PodShape, suffix: str) -> str:
     """The name of a FiberPool: the program's, what it wishes of a pod, and what is drawn by the
     caller so that no name is used twice.
     """

@@ -1,9 +1,9 @@
 """Children that wait for a pod.
 
 * ``Preparation`` makes the FiberPool on a thread, because that waits for the API server.
-* ``Waiting`` holds the children until an agent arrives or the time for that is over.
+* ``WaitingChildren`` holds the children until an agent arrives or the time for that is over.
 * ``Progress`` shows on stderr what the children wait for.
-* ``Reachability`` tells when running pods send no agent.  It is pure: ``now`` is an argument.
+* ``ReachabilityProbe`` tells when running pods send no agent.  It is pure: ``now`` is an argument.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from typing import Any
 from fiber._backends.agent_set import AgentSet
 from fiber._backends.kubernetes.api import Api
 from fiber._backends.kubernetes.problems import (
+    AgentRoute,
     PoolName,
-    Way,
     failure,
     new_problems,
     overdue,
@@ -29,13 +29,13 @@ from fiber._backends.kubernetes.problems import (
     summary,
     unreachable,
 )
-from fiber._backends.kubernetes.program import PreparedPool
-from fiber._logs import Output
+from fiber._backends.kubernetes.provisioner import PreparedPool
+from fiber._logs import OutputWriter
 from fiber._transport.loop import EventLoop, Loop, ScheduledCall
 from fiber.errors import FiberError
 
 
-class Waiting:
+class WaitingChildren:
     """The children of one FiberPool that have no agent yet.  On the loop's thread.
 
     ``on_begin`` is called as somebody begins to wait while there is no agent at all.
@@ -44,7 +44,7 @@ class Waiting:
     def __init__(
         self,
         agents: AgentSet,
-        output: Output,
+        output: OutputWriter,
         api: Api,
         timeout: float,
         *,
@@ -52,7 +52,7 @@ class Waiting:
     ) -> None:
         self.pool = PoolName("", "")
         """Pool that they wait for, once it has a name."""
-        self.way = Way("")
+        self.way = AgentRoute("")
         """Way of its agents to this program, once it has a name."""
         self.status: Mapping[str, Any] = {}
         """Present status of the pool."""
@@ -65,8 +65,8 @@ class Waiting:
         self._timeout = timeout
         self._on_begin = on_begin
         self._patience: ScheduledCall | None = None
-        self._reachability = Reachability()
-        self._verdict = Verdict.OPEN
+        self._reachability = ReachabilityProbe()
+        self._verdict = Reachability.OPEN
         self._told_of_verdict = False
         self._next_judgement: ScheduledCall | None = None
         self._told_of_limit = False
@@ -159,7 +159,7 @@ class Waiting:
         loop = self._agents.loop
         self._cancel_judgement()
         self._verdict = self._reachability.judge(running(self.status), now := loop.now())
-        if self._verdict is Verdict.OPEN:
+        if self._verdict is Reachability.OPEN:
             self._told_of_verdict = False
         if self._reachability.due < math.inf:
             pause = self._reachability.due - now
@@ -178,12 +178,12 @@ class Waiting:
     def _unreachable(self) -> FiberError | None:
         # The agents of a pool that was taken over may serve its last master, for as long as that
         # lives.
-        if self._verdict is not Verdict.UNREACHABLE or self.way.displaced:
+        if self._verdict is not Reachability.UNREACHABLE or self.way.displaced:
             return None
         return unreachable(self.pool, self.status, DOUBTED_AFTER + GIVEN_UP_AFTER, self.way)
 
     def _tell_of_doubts(self) -> None:
-        if self._verdict is Verdict.OPEN or self._told_of_verdict or not self._alone:
+        if self._verdict is Reachability.OPEN or self._told_of_verdict or not self._alone:
             return
         self._told_of_verdict = True
         doubt = unreachable(self.pool, self.status, DOUBTED_AFTER, self.way)
@@ -206,7 +206,7 @@ class Waiting:
 
     def _describe(self) -> str:
         state = summary(self.status, time.time()) if self.attached else self._api_state()
-        unreached = self._verdict is not Verdict.OPEN
+        unreached = self._verdict is not Reachability.OPEN
         where = f", no agent has reached {self.way.address}" if unreached else ""
         return f"waiting for pods: {state}{where}"
 
@@ -232,7 +232,7 @@ class Progress:
     On the loop's thread.
     """
 
-    def __init__(self, loop: EventLoop, output: Output, describe: Callable[[], str]) -> None:
+    def __init__(self, loop: EventLoop, output: OutputWriter, describe: Callable[[], str]) -> None:
         self._loop = loop
         self._output = output
         self._describe = describe
@@ -291,7 +291,7 @@ _LATE = 2.0
 held up, and that agents had to wait for it."""
 
 
-class Verdict(enum.Enum):
+class Reachability(enum.Enum):
     """Conclusion from running pods that send no agent."""
 
     OPEN = enum.auto()
@@ -299,7 +299,7 @@ class Verdict(enum.Enum):
     UNREACHABLE = enum.auto()
 
 
-class Reachability:
+class ReachabilityProbe:
     """Record of the running pods of one pool, and of the first sign of an agent."""
 
     def __init__(self) -> None:
@@ -315,12 +315,12 @@ class Reachability:
         self._proven = True
         self.due = math.inf
 
-    def judge(self, running: int, now: float) -> Verdict:
+    def judge(self, running: int, now: float) -> Reachability:
         """Return the conclusion, with ``running`` pods there now."""
         late, self.due = now > self.due + _LATE, math.inf
         if not running or self._proven:
             self._running = 0
-            return Verdict.OPEN
+            return Reachability.OPEN
         if not self._running or late:
             self._since = now
         if running > self._running or late:
@@ -329,9 +329,9 @@ class Reachability:
         doubted_at = self._since + DOUBTED_AFTER
         given_up_at = max(doubted_at + GIVEN_UP_AFTER, self._newest + DOUBTED_AFTER)
         if now >= given_up_at:
-            return Verdict.UNREACHABLE
+            return Reachability.UNREACHABLE
         self.due = given_up_at if now >= doubted_at else doubted_at
-        return Verdict.OPEN if now < doubted_at else Verdict.DOUBTFUL
+        return Reachability.OPEN if now < doubted_at else Reachability.DOUBTFUL
 
 
 class Preparation:

@@ -30,11 +30,11 @@ from fiber._backends.kubernetes.api import (
     Forbidden,
     NotFound,
 )
-from fiber._backends.kubernetes.attached_pool import Master, OwnPool, WarmPool, read_pool_key
-from fiber._backends.kubernetes.fiber_pool import Attachment
+from fiber._backends.kubernetes.attached_pool import OwnPool, PoolMaster, WarmPool, read_pool_key
+from fiber._backends.kubernetes.fiber_pool import AttachablePool
 from fiber._backends.kubernetes.problems import explain
 from fiber._backends.kubernetes.template import (
-    Shape,
+    PodShape,
     fiber_pool_body,
     own_container,
     pod_template,
@@ -80,7 +80,7 @@ class PreparedPool(NamedTuple):
     listener: MasterListener
     address: str
     """``host:port`` at which pods are to reach this program."""
-    attachment: Attachment
+    attachment: AttachablePool
     slots: int
     """Processes that each of its pods runs."""
     min_pods: int
@@ -88,7 +88,7 @@ class PreparedPool(NamedTuple):
     max_pods: int
 
 
-class Program:
+class PoolProvisioner:
     """Prepares FiberPools for one program.
 
     Its methods ask the API server, and block until that has answered or ``cancel`` is set.
@@ -116,7 +116,7 @@ class Program:
         self.api.close()
 
     def prepare_own(
-        self, shape: Shape, loop: Loop, observer: ListenerObserver, cancel: threading.Event
+        self, shape: PodShape, loop: Loop, observer: ListenerObserver, cancel: threading.Event
     ) -> PreparedPool:
         """A pool of this program's own, for pods of this shape."""
         number = next(self._numbers)
@@ -125,7 +125,7 @@ class Program:
         credentials = make_credentials(certificate=self._certificate)
         own = self._find_own_pod(cancel)
         container = own_container(own, _mountinfo()) if own is not None else ""
-        claims = self._claims(own, container, cancel) if own is not None else Claims()
+        claims = self._claims(own, container, cancel) if own is not None else VolumeClaims()
         model = without_claims(own, claims.one_node) if own is not None else None
         template = pod_template(shape, model, container, sys.executable)
         if own is not None and number == 0:
@@ -163,7 +163,7 @@ class Program:
 
     def _listen(
         self, pool: str, credentials: MasterCredentials, loop: Loop, observer: ListenerObserver
-    ) -> tuple[Master, MasterListener]:
+    ) -> tuple[PoolMaster, MasterListener]:
         config = self._config
         bound, host = self._addresses(pool)
         listener = MasterListener(
@@ -175,7 +175,7 @@ class Program:
             on_proven=observer.on_proven,
             objection=observer.objection,
             keepalive=Keepalive(config.heartbeat_interval, config.suspect_after, config.lost_after),
-            lost_grace=Master.lost_grace,
+            lost_grace=PoolMaster.lost_grace,
         )
         return self._master(host, listener), listener
 
@@ -196,10 +196,10 @@ class Program:
         found = reachable_address(self._api, listen, pool=pool, namespace=self.namespace)
         return listen or found, advertised or found
 
-    def _master(self, host: str, listener: MasterListener) -> Master:
+    def _master(self, host: str, listener: MasterListener) -> PoolMaster:
         port = int(listener.address.rpartition(":")[2])
         # The suffix makes it this program's, and not an earlier one's of the same pid.
-        return Master(host, port, f"{socket.gethostname()}:{os.getpid()}:{self._suffix}")
+        return PoolMaster(host, port, f"{socket.gethostname()}:{os.getpid()}:{self._suffix}")
 
     def _find_own_pod(self, cancel: threading.Event) -> Body | None:
         """The pod that this program runs in, if it is in one."""
@@ -227,7 +227,7 @@ class Program:
         except ApiError as error:
             raise self._explained(error, f"read this program's pod {name!r}", "") from error
 
-    def _claims(self, own: Body, container: str, cancel: threading.Event) -> Claims:
+    def _claims(self, own: Body, container: str, cancel: threading.Event) -> VolumeClaims:
         try:
             return look_up(self._api, self.namespace, own, container, cancel)
         except ApiError as error:
@@ -365,7 +365,7 @@ def _is_reachable(host: str) -> bool:
 _ONE_NODE = {"ReadWriteOnce", "ReadWriteOncePod"}
 
 
-class Claims(NamedTuple):
+class VolumeClaims(NamedTuple):
     """The claims that need a word."""
 
     one_node: tuple[str, ...] = ()
@@ -396,7 +396,7 @@ class Claims(NamedTuple):
 
 def look_up(
     api: Api, namespace: str, pod: Mapping[str, Any], container: str, cancel: threading.Event
-) -> Claims:
+) -> VolumeClaims:
     """Ask what the claims allow that the container mounts, for workers in ``namespace``."""
     found = next(c for c in pod["spec"]["containers"] if c["name"] == container)
     uses = (*(found.get("volumeMounts") or ()), *(found.get("volumeDevices") or ()))
@@ -412,7 +412,7 @@ def look_up(
             modes = set(spec.get("accessModes") or ())
             if modes and modes <= _ONE_NODE:
                 one_node.append(claim)
-    return Claims(tuple(one_node), unread)
+    return VolumeClaims(tuple(one_node), unread)
 
 
 def without_claims(pod: Mapping[str, Any], claims: Collection[str]) -> Body:
