@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from fiber._backends import output
+from fiber import _logs
 from fiber._logs import OutputWriter
 from patience import PATIENCE
 
@@ -41,8 +41,8 @@ class Stuck(io.StringIO):
 def stderr(monkeypatch: pytest.MonkeyPatch) -> Stuck:
     stuck = Stuck()
     # pytest puts its own sys.stderr in place after the fixtures.
-    monkeypatch.setattr(output, "sys", SimpleNamespace(stderr=stuck))
-    monkeypatch.setattr(output, "_ROOM", 1000)
+    monkeypatch.setattr(_logs, "sys", SimpleNamespace(stderr=stuck))
+    monkeypatch.setattr(_logs, "_ROOM", 1000)
     return stuck
 
 
@@ -110,7 +110,7 @@ def test_a_line_stands_below_what_is_written(stderr: Stuck, lines: OutputWriter)
     stderr.wait_for("2 of 2")
     lines.show("")
     lines.close()
-    erase = output._ERASE
+    erase = _logs._ERASE
     assert stderr.getvalue() == f"1 of 2{erase}[w] line 1\n1 of 2{erase}2 of 2{erase}"
 
 
@@ -118,7 +118,7 @@ def test_a_line_that_stands_goes_at_the_end(stderr: Stuck, lines: OutputWriter) 
     stderr.goes_on.set()
     lines.show("1 of 2")
     lines.close()
-    assert stderr.getvalue() in (f"1 of 2{output._ERASE}", "")
+    assert stderr.getvalue() in (f"1 of 2{_logs._ERASE}", "")
 
 
 def test_a_stuck_stderr_gathers_no_lines_that_were_shown(
