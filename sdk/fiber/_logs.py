@@ -50,16 +50,17 @@ def show(level: str) -> None:
 
 
 _ROOM = 4 << 20
-"""Characters that may wait for stderr.  Above that lines are left out, until half of it is free."""
+"""Characters that may wait for stderr.  Above that, lines are dropped until half of it is free."""
 
 
 _ERASE = "\r\x1b[K"
-"""Takes away what stands in a terminal's last line."""
+"""Control characters that erase the last line of a terminal."""
 
 
 class OutputWriter:
-    """Lines on their way to stderr.  One that is slow, stuck or broken holds up nobody: what it
-    has no room for is left out, and how much that was is said in its place.
+    """Writer of lines to stderr, on a thread.  A slow, stuck or broken stderr blocks no caller.
+
+    Lines for which there is no room are dropped.  A line in their place says how many.
     """
 
     def __init__(self) -> None:
@@ -67,16 +68,16 @@ class OutputWriter:
         self._thread: threading.Thread | None = None
         self._lock = threading.Lock()
         self._waiting = 0
-        """Characters in the queue, and those that are being written."""
+        """Characters that are in the queue or being written."""
         self._left_out = 0
-        """Lines since the last that was taken."""
+        """Lines dropped since the last line that was accepted."""
         self._line = ""
-        """Line that stands below the output."""
+        """Status line below the output; empty if there is none."""
         self._redraws = False
-        """True if the thread must draw that line anew."""
+        """True if the thread must draw the status line again."""
 
     def write(self, who: str, text: str) -> None:
-        """Lines of ``who``; returns at once."""
+        """Queue lines of ``who``; return at once."""
         self._start()
         lines = "".join(f"[{who}] {line}\n" for line in text.split("\n"))
         with self._lock:
@@ -87,8 +88,9 @@ class OutputWriter:
                 self._put(lines)
 
     def show(self, line: str) -> None:
-        """Have ``line`` stand below all that is written, in place of the one before; returns at
-        once.  For a terminal.
+        """Show ``line`` as the status line of the terminal; return at once.
+
+        It replaces the earlier status line, and stays below the lines that are written.
         """
         self._start()
         with self._lock:
@@ -98,7 +100,7 @@ class OutputWriter:
                 self._lines.put("")
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write the queued lines, and end the thread."""
         if self._line:
             self.show("")
         with self._lock:
@@ -136,7 +138,7 @@ class OutputWriter:
         while (lines := self._lines.get()) is not None:
             with self._lock:
                 line, self._redraws = self._line, False
-            # A full disk or a closed terminal must not cost more than the lines.
+            # A full disk or a closed terminal costs only the lines.
             with contextlib.suppress(OSError, ValueError):
                 _write(f"{_ERASE if shown else ''}{lines}{line}")
             shown = line
@@ -152,11 +154,11 @@ def _write(text: str) -> None:
         stream.write(text)
         stream.flush()
         return
-    # Past its buffer, where another thread's print may have put half of a line.
+    # Not through the stream's buffer, in which half a line of another thread may be.
     descriptor = stream.fileno()
     data = text.encode(stream.encoding, stream.errors or "strict")
     while data:
-        # A pipe keeps together what is written by one call, up to this size.
+        # A pipe keeps the bytes of one call together, up to this size.
         end = data.rfind(b"\n", 0, select.PIPE_BUF) + 1
         if not end:  # a longer line, or the last one
             end = data.find(b"\n") + 1 or len(data)

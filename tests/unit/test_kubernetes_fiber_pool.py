@@ -431,7 +431,7 @@ def test_an_operator_that_is_silent(rig: Rig, told: Told, monkeypatch: pytest.Mo
     assert error.reason == "NoOperator"
     assert "helm install fiber-operator" in str(error)
     (warning,) = told.warnings
-    assert "was not looked at by an operator" in warning
+    assert "was not reconciled by an operator" in warning
 
 
 def test_a_pool_of_which_nothing_comes_is_given_back_at_once(

@@ -201,7 +201,7 @@ def test_an_agent_whose_pod_is_about_to_go_is_not_let_in(site: Site) -> None:
     }
     pods.on_pod("a", {"metadata": metadata})
     link: Any = SimpleNamespace(peer=SimpleNamespace(name="a", uid="uid"))
-    assert pods.on_agent(link) == "a, whose pod is about to go"
+    assert pods.on_agent(link) == "a, whose pod is ending"
     assert not pods.agents.agents
     pods.close()
 
@@ -230,7 +230,7 @@ def test_a_wait_for_the_api_server_says_so(site: Site) -> None:
     site.api.trouble = "etcd has no leader"
     child, owner = site.start()
     assert owner.gone.wait(PATIENCE)
-    assert "kube is asked again and again: etcd has no leader" in str(child.start_error)
+    assert "kube fail and are repeated: etcd has no leader" in str(child.start_error)
     pods.close()
 
 
@@ -374,7 +374,7 @@ def test_an_agent_with_another_uid_is_not_let_in(site: Site) -> None:
     assert pods.objection(identity("es-1-a", "uid")) is None, "the watch has no such pod yet"
     pods.on_pod("es-1-a", RUNNING)
     assert pods.objection(identity("es-1-a", "uid")) == ""
-    assert "has the uid 'forged'" in (pods.objection(identity("es-1-a", "forged")) or "")
+    assert "another uid than 'forged'" in (pods.objection(identity("es-1-a", "forged")) or "")
     pods.close()
 
 

@@ -77,9 +77,8 @@ class Site:
         placement: Placement[Any, Any] = Placement(1, spread=False)
         self.agents = AgentSet(self.loop, hub, output, placement)
         self.waiting = WaitingChildren(self.agents, output, api, 600.0, on_begin=lambda: None)
-        self.waiting.pool = PoolName("es-1", "lab")
-        self.waiting.way = AgentRoute("10.0.0.7:41337", displaced)
-        self.waiting.attached = True
+        self.waiting.on_named(PoolName("es-1", "lab"))
+        self.waiting.on_attached(AgentRoute("10.0.0.7:41337", displaced))
 
     def start(self) -> Any:
         """Have one more child wait."""

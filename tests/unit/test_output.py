@@ -138,7 +138,7 @@ def test_without_a_thread_lines_are_written_at_the_end(
     def refuse(thread: threading.Thread) -> None:
         raise RuntimeError("can't start new thread")
 
-    lines = Output()
+    lines = OutputWriter()
     with monkeypatch.context() as patched:
         patched.setattr(threading.Thread, "start", refuse)
         lines.write("one", "first")

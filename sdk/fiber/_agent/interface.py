@@ -125,7 +125,7 @@ class ChildObserver(Protocol):
 
 
 class DirectChannel(Protocol):
-    """Task channel of a pool worker, lent to the threads of the master."""
+    """Task channel of a pool worker, for direct use by threads of the master."""
 
     def send(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
         """Send a packet, as ``ChildHandle.deliver`` does.  OSError: the packet was not sent."""
@@ -193,26 +193,24 @@ class ChildHandle(Protocol):
 
 
 class Backend(Protocol):
-    """Owns the agents of one program."""
+    """Owner of the agents of one program."""
 
     name: str
     same_host: bool
-    """True if its agents run on the program's host, so that descriptors can be handed over."""
+    """True if the agents run on the program's host, so that descriptors can be handed over."""
 
     same_pids: bool
-    """True if the pids of its children are those of this host and this PID namespace."""
+    """True if the pids of the children are those of this host and this PID namespace."""
 
     elastic: bool
-    """True if a host may be made for a child.  Starting a child does not wait for its host."""
+    """True if hosts are made for children.  Starting a child does not wait for its host."""
 
     @property
     def sends_program(self) -> bool:
-        """True if its agents need the program's files for their children."""
+        """True if the agents need the program's files for their children."""
 
     def child(self, spec: ChildSpec, observer: ChildObserver) -> ChildHandle:
-        """A child to be started, at once or when there is room for it; raises what is known to be
-        in the way.  From anywhere.
-        """
+        """Return a child, not started yet; raise errors that are known already.  Any thread."""
 
     def close(self) -> None:
-        """End every agent and its children.  Not on the loop's thread."""
+        """End all agents and their children.  Must not be called on the loop's thread."""

@@ -1,4 +1,4 @@
-"""The agents of one shape, and the children that wait for them: what loopback and pods share."""
+"""Agents of one shape and the children that wait for them, for loopback agents and for pods."""
 
 from __future__ import annotations
 
@@ -16,12 +16,11 @@ from fiber._transport.loop import EventLoop
 
 
 class AgentSet:
-    """Gives each child an agent: at once, or as soon as one has room.
+    """Set of agents that gives each child an agent: at once, or as soon as one has room.
 
-    ``on_change`` is called, on the loop's thread, whenever more or fewer agents may be wanted;
-    ``on_lost`` with an agent that is gone and why, before its children are told; ``on_leaving``
-    with one that is about to go.  ``child`` comes from anywhere, everything else happens on the
-    loop's thread.
+    ``on_change`` is called when the number of wanted agents may have changed.  ``on_lost`` gets a
+    lost agent and the reason, before its children end.  ``on_leaving`` gets an agent that takes no
+    new work.  Any thread may call ``child``.  All else runs on the loop's thread.
     """
 
     def __init__(
@@ -37,13 +36,13 @@ class AgentSet:
     ) -> None:
         self.loop = loop
         self.placement = placement
-        """Placement of children on agents."""
+        """Placement of children on agents.  Other objects only read it, except Demand."""
         self.agents: dict[str, RemoteAgent] = {}
         """Agents that have joined and are not lost, by name."""
         self.joined = 0
         """Number of agents that ever joined."""
         self.error: Exception | None = None
-        """Error for which no agent will come."""
+        """Reason why no agent will come."""
         self._successor: Callable[[], AgentSet] | None = None
         self._hub = hub
         self._output = output
@@ -54,18 +53,18 @@ class AgentSet:
 
     @property
     def children(self) -> int:
-        """Number of children, with those that wait or are about to be started."""
+        """Number of children, including those that wait or are not started yet."""
         placement = self.placement
         return placement.children + len(placement.waiting) + len(self._not_started)
 
     def child(self, spec: ChildSpec, observer: ChildObserver) -> RemoteChild:
-        """A child to be started."""
+        """Return a child, not started yet."""
         child = RemoteChild(self, spec, observer)
         self._not_started.add(child)
         return child
 
     def start(self, child: RemoteChild) -> None:
-        """Give it an agent, now or as soon as there is room."""
+        """Give a child an agent, now or as soon as one has room."""
         self._not_started.discard(child)
         if self._successor is not None:
             child.move(self._successor())
@@ -84,7 +83,7 @@ class AgentSet:
         return waited
 
     def join(self, host: str, link: Link) -> RemoteAgent:
-        """An agent has dialled in."""
+        """Add an agent that has dialed in."""
         agent = RemoteAgent(host, link, self.loop, self._hub, self._output, self)
         _logs.debug("agent %s has joined", host)
         self.agents[host] = agent
@@ -95,20 +94,24 @@ class AgentSet:
         self._place()
         return agent
 
+    def set_slots(self, slots: int) -> None:
+        """Set the number of children that each agent runs, before the first agent joins."""
+        self.placement.slots = slots
+
     def expect(self, agents: int) -> None:
-        """So many are about to join."""
+        """Expect so many agents to join soon."""
         if agents != self.placement.expected:
             self.placement.expected = agents
             self._place()
 
     def fail(self, error: Exception) -> None:
-        """No agent will come: if there is none, nobody has to wait."""
+        """Note that no agent will come.  If there is none, refuse the waiting children."""
         self.error = error
         if not self.placement.loads:
             self.refuse_waiting(error)
 
     def hand_over(self, successor: Callable[[], AgentSet]) -> None:
-        """Give waiting and later children to ``successor``: no agent comes here."""
+        """Give waiting and later children to ``successor``, since no agent comes here."""
         self._successor = successor
         for child in self._take_waiting():
             self.start(child)
@@ -131,7 +134,7 @@ class AgentSet:
             agent.start(child)
         self._on_change()
 
-    # What becomes of agents
+    # Ends of agents
 
     def lost(self, agent: RemoteAgent, reason: str) -> None:
         """Note that an agent is lost."""
@@ -141,12 +144,12 @@ class AgentSet:
             self.placement.remove(agent)
         self._on_lost(agent, reason)
         if self.error is not None and not self.placement.loads:
-            self.refuse_waiting(self.error)  # they waited for room that it would have had
+            self.refuse_waiting(self.error)  # they waited for room on the lost agent
         else:
             self._on_change()
 
     def leaving(self, agent: RemoteAgent) -> None:
-        """Note that an agent takes no new children.  Its room does not count from now on."""
+        """Place no more children on an agent that is about to leave."""
         _logs.debug("agent %s leaves: %s", agent.host, agent.leaving)
         if agent in self.placement.loads:
             self.placement.remove(agent)
@@ -154,14 +157,14 @@ class AgentSet:
         self._on_change()
 
     def child_gone(self, agent: RemoteAgent) -> None:
-        """Note that a child of an agent has ended, and left room for another."""
+        """Note that a child of an agent has ended, so there is room for another."""
         if agent in self.placement.loads:
             self.placement.ended(agent, self.loop.now())
             self._place()
 
     def suspected(self, agent: RemoteAgent, suspect: bool) -> None:
         """Give an agent no children while it is silent."""
-        _logs.debug("agent %s is %s", agent.host, "silent" if suspect else "heard again")
+        _logs.debug("agent %s is %s", agent.host, "silent" if suspect else "back")
         self.withhold(agent, suspect, "silent")
 
     def withhold(self, agent: RemoteAgent, withheld: bool, why: str) -> None:

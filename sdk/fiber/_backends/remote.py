@@ -37,36 +37,37 @@ _REMEMBERED = 1024
 
 
 class AgentObserver(Protocol):
-    """Hears what becomes of an agent; on the loop's thread."""
+    """Observer of an agent.  Called on the loop's thread."""
 
     def lost(self, agent: RemoteAgent, reason: str) -> None:
-        """Note that an agent is lost for good.  Its children are told after this."""
+        """Note that an agent is lost for good.  Its children end after this call."""
 
     def child_gone(self, agent: RemoteAgent) -> None:
         """Note that a child of an agent has ended."""
 
     def suspected(self, agent: RemoteAgent, suspect: bool) -> None:
-        """Note that an agent is silent, or is heard again."""
+        """Note that an agent is silent, or that it answers again."""
 
     def leaving(self, agent: RemoteAgent) -> None:
         """Note that an agent takes no new children."""
 
 
 class Starter(Protocol):
-    """Sees to it that children get an agent; on the loop's thread."""
+    """Starter of children, which gives them agents.  Called on the loop's thread."""
 
     loop: EventLoop
 
     def start(self, child: RemoteChild) -> None:
-        """Have it started, now or as soon as there is room."""
+        """Start a child, now or as soon as there is room."""
 
     def withdraw(self, child: RemoteChild) -> bool:
         """Withdraw a child; return False if it has an agent already."""
 
 
 class RemoteAgent:
-    """An agent that has dialled in.  Everything but ``send`` and ``close`` happens on the loop's
-    thread.
+    """Agent that has dialed in.
+
+    Any thread may call ``send`` and ``close``.  All else runs on the loop's thread.
     """
 
     def __init__(
@@ -81,17 +82,17 @@ class RemoteAgent:
         self.host = host
         self.loop = loop
         self.lost: str | None = None
-        """Why it is gone for good."""
+        """Reason why the agent is lost; None while it is not."""
         self.pod = self.node = ""
-        """The pod that it runs in, and that pod's node; empty if it is in none."""
+        """Pod of the agent, and node of that pod; empty if it is in no pod."""
         self.ending = ""
-        """Why its pod is about to go, where that is known."""
+        """Reason why the pod ends or has ended; empty if it is not known."""
         self.disrupted = False
-        """True if the cluster ends its pod."""
+        """True if the cluster ends the pod."""
         self.leaving = ""
-        """Reason why it takes no new work and is about to go; empty if it stays."""
+        """Reason why the agent takes no new work and will end; empty if it stays."""
         self.suspect = False
-        """True if it has been silent for a while."""
+        """True while the agent is silent for longer than usual."""
         self._link = link
         self._blobs = BlobSender(loop, self._put)
         self._hub = hub
@@ -102,7 +103,7 @@ class RemoteAgent:
         self._children: dict[int, RemoteChild] = {}
 
     def start(self, child: RemoteChild) -> None:
-        """Start a child, once all that it needs is there."""
+        """Start a child, once the agent has all blobs that the child needs."""
         if self.lost is not None:
             child.end(self._report_of_loss(self.lost))
             return
@@ -111,18 +112,22 @@ class RemoteAgent:
         child.place(self, number)
         self._blobs.send_missing(child.blobs, child.begin)
 
+    def describe_pod(self, pod: str, node: str, *, ending: str, disrupted: bool) -> None:
+        """Set what reports tell of the agent's pod."""
+        self.pod, self.node, self.ending, self.disrupted = pod, node, ending, disrupted
+
     def withdraw(self, child: RemoteChild) -> bool:
-        """None waits here."""
+        """Return False: no child waits here."""
         return False
 
     def send(self, message: messages.LinkMessage) -> None:
-        """Send a message.  From anywhere."""
+        """Send a message.  Any thread."""
         self.loop.call_soon(self.transmit, message)
 
     def transmit(
         self, message: messages.LinkMessage, on_left: Callable[[], None] | None = None
     ) -> None:
-        """Send a message now; ``on_left`` is called once the last of it is on its way."""
+        """Send a message; call ``on_left`` once the whole message has left."""
         self._hub_link.flush()
         self._put(message, on_left)
 
@@ -133,11 +138,11 @@ class RemoteAgent:
         self._link.send(*messages.pieces(message), lane=lane, on_left=on_left)
 
     def close(self) -> None:
-        """End it and its children.  From anywhere."""
+        """End the agent and its children.  Any thread."""
         self.send(messages.Shutdown(_SHUTDOWN_GRACE))
 
     def leave(self, reason: str) -> None:
-        """Note that the agent is about to go: its workers get no new work."""
+        """Note that the agent will end: its workers get no new work."""
         if self.leaving or self.lost is not None:
             return
         self.leaving = reason
@@ -154,7 +159,7 @@ class RemoteAgent:
         self._hub.unlink(self.host, reason)
         try:
             self._observer.lost(self, reason)
-        finally:  # whatever becomes of it, nobody must wait for these
+        finally:  # also after an error, so that no caller waits for these children
             children, self._children = self._children, {}
             for child in children.values():
                 child.end(self._report_of_loss(reason))
@@ -164,8 +169,8 @@ class RemoteAgent:
         return ExitReport(-signal.SIGKILL, why, host=self.host, cause=Cause.AGENT_LOST)
 
     def explain(self, report: ExitReport) -> ExitReport:
-        """Add to a child's report where that was, and whether the cluster ended it."""
-        # The report's claims do not count.
+        """Add the pod and node to a child's report, and whether the cluster ended the child."""
+        # The agent's own claims about host, pod and node do not count.
         report = report._replace(host=self.host, pod=self.pod, node=self.node)
         if report.cause == Cause.AGENT_LOST:
             return report._replace(disrupted=self.disrupted)
@@ -177,10 +182,10 @@ class RemoteAgent:
             return report._replace(reason=self.ending, disrupted=self.disrupted and killed)
         return report
 
-    # What comes over the link
+    # Frames and events of the link
 
     def on_frame(self, frame: Frame) -> None:
-        """Take a message of the agent about its children."""
+        """Handle a message of the agent."""
         message = messages.decode(frame)
         if isinstance(message, messages.HubMessage):
             self._hub_link.on_frame(message)
@@ -197,37 +202,37 @@ class RemoteAgent:
             return
         if isinstance(message, messages.Exited):
             del self._children[message.child]
-            self._observer.child_gone(self)  # there is room for what its end makes anybody start
-        child.heard(message, self._output)
+            self._observer.child_gone(self)  # before the observer of the child may start another
+        child.on_message(message, self._output)
 
     def on_suspect(self) -> None:
-        """Silent for a while."""
+        """Note that the agent is silent."""
         self.suspect = True
         self._observer.suspected(self, True)
 
     def on_trusted(self) -> None:
-        """Heard again."""
+        """Note that the agent answers again."""
         self.suspect = False
         self._observer.suspected(self, False)
 
     def on_lost(self, reason: str) -> None:
-        """The link is over.  Long silence is that of a node or of a network, not of a task."""
+        """Note that the link has ended.  After a long silence the node or network is to blame."""
         self.lose(reason, disrupted=self.suspect)
 
 
 @lru_cache(maxsize=8)
 def _preparation(data: bytes) -> Blob:
-    """The blob of a preparation: few are in use at a time, and agents forget the others."""
+    """Return the blob of a preparation.  Few are in use at a time; agents forget the others."""
     return Blob(data)
 
 
 class RemoteChild:
-    """A ``ChildHandle`` whose child is, or will be, on another host."""
+    """Child that runs, or will run, on another host; a ``ChildHandle``."""
 
     def __init__(self, starter: Starter, spec: ChildSpec, observer: ChildObserver) -> None:
         self.name = spec.name
         self.is_worker = spec.tasks
-        """True for a worker of a pool."""
+        """True for a pool worker."""
         self.host = ""
         """Host of the child; empty while it waits for an agent."""
         self.pid: int | None = None
@@ -238,46 +243,46 @@ class RemoteChild:
         self._agent: RemoteAgent | None = None
         self._number = 0
         self._ended_by = 0
-        """Fatal signal that was sent to it before it had begun."""
+        """Fatal signal that was sent to the child before it had started."""
         self._early: list[tuple[int, BytesLike, Sequence[memoryview]]] = []
-        """Packets to deliver after its Start."""
+        """Packets to deliver after the Start."""
         self._unasked: list[messages.LinkMessage] | None = []
-        """Signals and recalls, which wait until its Start has left: they would pass a large one."""
+        """Signals and recalls until the Start has left; they would overtake a large Start."""
         self._delivered = 0
         self._latest: deque[int] = deque(maxlen=_REMEMBERED)
         self._channel: RemoteTaskChannel | None = None
         self._gone = False
         needed = (_preparation(spec.preparation), spec.program, spec.arguments)
         self.blobs = [blob for blob in needed if blob is not None]
-        """Blobs that its agent must have while the child lives."""
+        """Blobs that the agent must have while the child lives."""
         digests = tuple(blob and blob.digest for blob in needed)
         fields = (spec.name, spec.method, spec.tasks, digests)
         self._asked: tuple[bytes, bytes] | None = None
-        """Start of the child, kept until it has started: its agent may be about to go."""
+        """Start that was sent, kept until the child runs, because its agent may refuse it."""
         self._start: tuple[bytes, bytes] | None = pickle.dumps(fields, protocol=5), spec.payload
 
     @property
     def node(self) -> str:
-        """The node of its agent's pod."""
+        """Node of the pod of the child's agent."""
         return "" if self._agent is None else self._agent.node
 
     @property
     def waiting(self) -> bool:
-        """True while it has no agent."""
+        """True while the child has no agent."""
         return self._agent is None and not self._gone
 
     @property
     def leaving(self) -> str:
-        """Why its agent is about to go."""
+        """Reason why the child's agent will end; empty if it stays."""
         agent = self._agent
         return "" if agent is None or not agent.leaving else agent.ending or agent.leaving
 
     def start(self) -> None:
-        """Have it started."""
+        """Start the child, now or as soon as there is an agent with room."""
         self._starter.start(self)
 
     def move(self, starter: Starter) -> None:
-        """Have it started by somebody else, while it has no agent."""
+        """Start the child by another ``starter``, while it has no agent."""
         self._starter = starter
         starter.start(self)
 
@@ -286,10 +291,10 @@ class RemoteChild:
         self._agent, self._number, self.host = agent, number, agent.host
 
     def begin(self) -> None:
-        """Have its agent start it: what it needs is there."""
+        """Send the Start: the agent has all that the child needs."""
         start, self._start = self._start, None
         if start is None or self._agent is None:
-            return  # its agent was lost meanwhile
+            return  # the agent was lost meanwhile
         self._asked = None if self.is_worker else start
         self._agent.transmit(messages.Start(self._number, *start), self._start_left)
         early, self._early = self._early, []
@@ -302,7 +307,7 @@ class RemoteChild:
             self._tell(message)
 
     def deliver(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
-        """Send a packet to its task channel; False if its end is known."""
+        """Send a packet to the task channel; return False if the child has ended."""
         if self._gone:
             return False
         if self._agent is None or self._start is not None:
@@ -314,14 +319,14 @@ class RemoteChild:
         return True
 
     def lend(self) -> RemoteTaskChannel | None:
-        """Return its task channel, for direct use; None if it has ended."""
+        """Return the task channel for direct use; None if the child has ended."""
         if self._gone:
             return None
         self._channel = RemoteTaskChannel(self._loop, self.deliver)
         return self._channel
 
     def reclaim(self) -> None:
-        """Hear what it says again, and what nobody has received."""
+        """End the direct use; the observer gets the packets that were not received."""
         channel, self._channel = self._channel, None
         if channel is not None:
             for message in channel.drain():
@@ -332,7 +337,7 @@ class RemoteChild:
         self._loop.call_soon(self._ask, messages.Recall)
 
     def signal(self, signum: int) -> None:
-        """Send it a signal."""
+        """Send the child a signal."""
         self._loop.call_soon(self._ask, messages.Signal, signum)
 
     def _ask(self, message: Callable[..., messages.LinkMessage], *fields: int) -> None:
@@ -352,8 +357,8 @@ class RemoteChild:
         elif self._agent is not None and not self._gone:
             self._agent.transmit(message)
 
-    def heard(self, message: messages.LinkMessage, output: OutputWriter) -> None:
-        """Something about this child."""
+    def on_message(self, message: messages.LinkMessage, output: OutputWriter) -> None:
+        """Handle a message about this child."""
         if isinstance(message, messages.FromChild):
             buffers = [memoryview(buffer) for buffer in message.buffers]
             said = packet.Message(memoryview(message.payload), buffers, [])
@@ -399,7 +404,7 @@ class RemoteChild:
 
 
 class Send(Protocol):
-    """Sends a message to the agent; ``on_left`` is called once the last of it is on its way."""
+    """Function that sends a message, and calls ``on_left`` once the whole message has left."""
 
     def __call__(
         self, message: messages.LinkMessage, on_left: Callable[[], None] | None = None
@@ -407,10 +412,10 @@ class Send(Protocol):
 
 
 class BlobSender:
-    """Sends each blob once, and has the agent forget it when nobody here has it any more.
+    """Sender of blobs.  It sends each blob once, and Forget when no object refers to the blob.
 
-    So an agent keeps no more than this program does, and nobody counts: a blob lives as long as a
-    pool, a child or the program itself refers to it.  On the loop's thread.
+    So an agent keeps no more blobs than this program does.  A blob lives as long as a pool, a child
+    or the program refers to it.  Runs on the loop's thread.
     """
 
     def __init__(self, loop: EventLoop, send: Send) -> None:
@@ -420,12 +425,12 @@ class BlobSender:
         self._leaving: dict[bytes, int] = {}
         """Number of times that each blob was sent and has not left."""
         self._waiting: list[tuple[list[bytes], Callable[[], None]]] = []
-        """The blobs that a caller needs, and what follows when they have left."""
+        """Blobs that a caller needs, and the function to call when they have left."""
 
     def send_missing(self, blobs: Iterable[Blob], then: Callable[[], None]) -> None:
         """Send the blobs that the agent does not have, and call ``then`` when all have left.
 
-        What is sent next finds them there, though large messages pass one another.
+        Without this wait a small message could overtake a large blob.
         """
         needed = []
         for blob in blobs:
@@ -440,7 +445,7 @@ class BlobSender:
         self._go_on()
 
     def lost(self, digest: bytes) -> None:
-        """The agent could not keep it."""
+        """Note that the agent could not keep a blob."""
         self._sent.pop(digest, None)
 
     def _left(self, digest: bytes) -> None:
@@ -458,21 +463,23 @@ class BlobSender:
                 self._waiting.append((needed, then))
 
     def _forgetter(self, digest: bytes) -> Callable[[object], None]:
-        # A finalizer runs anywhere, and may only put something into the loop's queue.
+        # A finalizer runs on any thread, and may only put a call into the loop's queue.
         return lambda _: self._loop.call_soon(self._forget, digest)
 
     def _forget(self, digest: bytes) -> None:
         reference = self._sent.get(digest)
-        if reference is not None and reference() is None:  # otherwise it was made and sent again
+        if (
+            reference is not None and reference() is None
+        ):  # else the same blob was made and sent again
             del self._sent[digest]
             self._send(messages.Forget(digest))
 
 
 class RemoteTaskChannel:
-    """A ``DirectChannel``.  What it sends and receives passes the loop, and nothing above it.
+    """Task channel of a remote child, for direct use; a ``DirectChannel``.
 
-    ``deliver`` is the child handle's own.  Each wait has a lock of its own, which the loop
-    releases: an interruption at any line leaves at most a lock that nobody waits for.
+    Packets pass the loop only.  ``deliver`` is the method of the child.  Each wait makes a new
+    lock, which the loop releases: an interrupted wait leaves at most an unused lock.
     """
 
     def __init__(self, loop: EventLoop, deliver: Callable[..., bool]) -> None:
@@ -481,10 +488,10 @@ class RemoteTaskChannel:
         self._messages: deque[Message] = deque()
         self._waiting: deque[threading.Lock] = deque()
         self._under_way = 0
-        """The last packet that was sent and that the link does not have yet."""
+        """Sequence number of the last packet, until the link has it; then 0."""
         self._ended = False
 
-    # Whoever borrowed it
+    # The thread that uses the channel
 
     def send(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
         """Send a packet; BrokenPipeError if the worker is gone."""
@@ -494,9 +501,9 @@ class RemoteTaskChannel:
         self._loop.call_soon(self._send, seq, payload, buffers)
 
     def receive(self, timeout: float) -> Message | None:
-        """The next packet, None after ``timeout`` seconds.
+        """Return the next packet, or None after ``timeout`` seconds.
 
-        At the end EOFError, or BrokenPipeError if what was sent last never left.
+        EOFError: the worker ended.  BrokenPipeError: it ended before the last packet to it left.
         """
         if not self._messages and not self._ended:
             self._wait(timeout)
@@ -506,29 +513,29 @@ class RemoteTaskChannel:
             if not self._ended:
                 return None
         if self._under_way:
-            raise BrokenPipeError("the worker was gone before this was sent")
+            raise BrokenPipeError("the worker ended before the packet to it was sent")
         raise EOFError
 
     def close(self) -> None:
-        """Let go of it."""
+        """Do nothing: the channel has no descriptor."""
 
     def _wait(self, timeout: float) -> None:
         lock = threading.Lock()
         lock.acquire()
         self._waiting.append(lock)
-        # The loop notes what there is first and looks who waits then.
+        # The loop adds a message first, and then looks for waiting threads.
         if not self._messages and not self._ended:
             lock.acquire(timeout=timeout)
 
     # The loop's thread
 
     def put(self, message: Message) -> None:
-        """The worker sent it."""
+        """Add a packet of the worker."""
         self._messages.append(message)
         self._wake()
 
     def end(self) -> None:
-        """The worker is gone."""
+        """Note that the worker has ended."""
         self._ended = True
         self._wake()
 

@@ -1,4 +1,6 @@
-"""Backend whose agents are pods: one FiberPool for each shape of pod that a program asks for.
+"""Backend whose agents are pods, with one FiberPool for each pod shape that a program asks for.
+
+``Pods`` has the pods of one FiberPool as hosts for children.
 
 ``serves_pools`` decides for ``backend="auto"`` whether this backend can be used.
 """
@@ -36,7 +38,7 @@ from fiber_api.times import format_time, parse_time
 
 
 class KubernetesBackend:
-    """Shares the pods of each shape among all of the program's pools and processes."""
+    """Backend that shares the pods of each shape among the program's pools and processes."""
 
     name = "kubernetes"
     same_host = False
@@ -50,65 +52,67 @@ class KubernetesBackend:
         self._config = config
         self._output = OutputWriter()
         self._shape = PodShape.of(config)
-        self._program = PoolProvisioner(config)
+        self._provisioner = PoolProvisioner(config)
         self._pods: dict[tuple[PodShape | str, int], Pods] = {}
-        """Pods by their shape or pool, and by the number of such pods before them."""
+        """Pods by their shape or pool name, and by the number of such ``Pods`` before them."""
         self._closing = False
 
     def child(self, spec: ChildSpec, observer: ChildObserver) -> RemoteChild:
-        """A child in a pod that has what it wishes."""
+        """Return a child, not started yet, for a pod that has the resources it asks for."""
         pool = spec.resources.pool or self._config.pool
         key = pool or self._shape.with_resources(spec.resources)
         return self._find(key).agents.child(spec, observer)
 
     def _find(self, key: PodShape | str) -> Pods:
-        """Return the pods in use, or new ones.  There is no lock: a finalizer may call this too."""
+        """Return the ``Pods`` in use, or new ones.  No lock: a finalizer may call this."""
         before = 0
         while True:
             pods = self._pods.get((key, before))
-            if pods is None:  # one that another thread makes meanwhile has had no effect yet
+            if pods is None:  # another thread may make some too; unused ones have no effect
                 pods = self._pods.setdefault((key, before), self._make(key))
-                if self._closing:  # which may have looked before
+                if self._closing:  # ``close`` may have passed over them
                     pods.begin_close()
             if not pods.over:
                 return pods
             before += 1
 
     def _make(self, key: PodShape | str) -> Pods:
-        make = partial(Pods, self._loop, self._hub, self._output, self._config, self._program.api)
+        make = partial(
+            Pods, self._loop, self._hub, self._output, self._config, self._provisioner.api
+        )
         if isinstance(key, str):
-            return make(partial(self._program.prepare_warm, key, self._loop))
-        prepare = partial(self._program.prepare_own, key, self._loop)
+            return make(partial(self._provisioner.prepare_warm, key, self._loop))
+        prepare = partial(self._provisioner.prepare_own, key, self._loop)
         return make(prepare, successor=lambda: self._find(key).agents)
 
     def close(self) -> None:
-        """End the pods, and the pools or their use."""
+        """End all pods: delete the program's own pools, and detach from others."""
         self._closing = True
-        with contextlib.ExitStack() as rest:  # of which nothing is left out if it is interrupted
+        with contextlib.ExitStack() as rest:  # does all, also if it is interrupted
             rest.callback(self._output.close)
-            rest.callback(self._program.close)
+            rest.callback(self._provisioner.close)
             for pods in list(self._pods.values()):
                 pods.begin_close()
                 rest.callback(pods.close)
 
 
 _END_TIMEOUT = 10.0
-"""Seconds for the API server, and as many for the agents, to hear of the end."""
+"""Seconds that the API server may take at the end, and seconds for the agents."""
 
 _ENDED = ("Failed", "Succeeded")
 
-_NOT_OURS = "its FiberPool is not this program's any more"
+_NOT_OURS = "its FiberPool no longer belongs to this program"
 
 Document = Mapping[str, Any]
 
 
 class Pods:
-    """Begins with the first child, and asks for pods as children come and go.
+    """Pods of one FiberPool, which begins with the first child and scales with the children.
 
-    ``prepare`` says which pool that is and begins to listen for its agents; it blocks, until the
-    event that it is given is set, and raises FiberError.  ``successor`` has the agents of the next
-    such pool, where this one can be followed by another.  Everything but ``agents.child`` and
-    ``close`` happens on the loop's thread.
+    ``prepare`` returns the pool, and begins to listen for its agents.  It blocks until the event
+    that it gets is set, and raises FiberError.  ``successor`` returns the agents of the next pool,
+    if another one can follow.  Any thread may call ``agents.child`` and ``close``.  All else runs
+    on the loop's thread.
     """
 
     def __init__(
@@ -139,36 +143,36 @@ class Pods:
             self.agents, output, api, config.pod_timeout, on_begin=self._warn_anew
         )
         self.over = False
-        """True once the pool has failed or ended, and was given back."""
+        """True once the pool has failed or ended, and was deleted or detached from."""
         self._goes_on = False
-        """True if the children that wait then go to the successor."""
+        """True if waiting children then move to the successor."""
         self._preparation: Preparation | None = None
         self._prepared: PreparedPool | None = None
         self._client: FiberPoolClient | None = None
         self._closing = threading.Event()
-        """Set once the API server is asked for nothing but the end."""
+        """Set once these pods end."""
         self._decision_is_due = False
         self._timer: LoopTimer | None = None
         self._wanted = 0
         self._pods: dict[str, Document] = {}
         self._given_up: set[str] = set()
-        """Pods that are there and of which nothing is expected any more."""
+        """Existing pods whose agents are released or lost; they are served no more."""
         self._back_again: RemoteAgent | None = None
-        """Agent that is lost only because it has come again."""
+        """Agent that is lost only because the agent of the same pod has dialed again."""
 
     def begin_close(self) -> None:
-        """Begin to end; waits for nothing."""
+        """Begin to end the pool; return at once."""
         self._closing.set()
         if self._client is not None:
             self._client.begin_close(_END_TIMEOUT)
 
     def close(self) -> None:
-        """End the children, and the pool or its use.  Not on the loop's thread."""
+        """End the children and the pool, or detach.  Must not be called on the loop's thread."""
         self._closing.set()
         self._wait_for(lambda then: self._loop.call_soon(self._shut_down, then))
-        if (preparation := self._preparation) is not None:  # from here on there is no other
+        if (preparation := self._preparation) is not None:  # no other one begins after this
             preparation.join(_END_TIMEOUT)
-            self._wait_for(self._loop.call_soon)  # until what it prepared is known
+            self._wait_for(self._loop.call_soon)  # until ``_begin_with`` has run
         if self._client is not None:
             self._client.close(_END_TIMEOUT)
         if self._prepared is not None:
@@ -176,7 +180,7 @@ class Pods:
             self._wait_for(lambda then: listener.close("the master ended", then=then))
 
     def _wait_for(self, ask: Callable[[Callable[[], None]], None]) -> None:
-        """Until what is asked for is done on the loop's thread, if that still does anything."""
+        """Wait until the loop has done what ``ask`` asks for, unless the loop is broken."""
         done = threading.Event()
         ask(done.set)
         if not self._loop.broken:
@@ -190,7 +194,7 @@ class Pods:
             agent.close()
         then()
 
-    # -- The pool begins
+    # -- Begin of the pool
 
     def _begin(self) -> None:
         self._preparation = Preparation(
@@ -202,17 +206,17 @@ class Pods:
         self._preparation.start()
 
     def _failed_to_prepare(self, error: FiberError) -> None:
-        self._preparation = None  # the next child may have more luck
+        self._preparation = None  # the next child tries again
         self._waiting.refuse(error)
 
     def _begin_with(self, prepared: PreparedPool) -> None:
         self._prepared = prepared
         if self._closing.is_set():
-            return  # there is no pool yet, and nobody who wants one
-        self._placement.slots = prepared.slots
+            return  # the pool was not made yet, and is not needed
+        self.agents.set_slots(prepared.slots)
         self._demand.floor, self._demand.maximum = prepared.min_pods, prepared.max_pods
         attachment = prepared.attachment
-        self._waiting.pool = PoolName(attachment.name, attachment.namespace)
+        self._waiting.on_named(PoolName(attachment.name, attachment.namespace))
         self._client = FiberPoolClient(self._api, self._loop, attachment, self)
         self._client.start()
         self._changed()
@@ -221,7 +225,7 @@ class Pods:
         if self._client is not None:
             self._client.warn_anew()
 
-    # -- What it needs
+    # -- Demand for pods
 
     def _changed(self) -> None:
         if not self._decision_is_due:
@@ -250,61 +254,61 @@ class Pods:
     # -- Agents
 
     def on_proven(self) -> None:
-        """Note that pods reach this program.  A stranger's connection does not show that."""
+        """Note that pods reach this program.  Connections of strangers do not prove that."""
         self._waiting.reached()
 
     def on_refused(self, why: str) -> None:
-        """Somebody dialled who is not served."""
-        if not self._closing.is_set():  # else that is how it is to be
+        """Report a connection that was refused."""
+        if not self._closing.is_set():  # else refusals are expected
             self._output.write("fiber", f"an agent was refused: {why}")
 
     def objection(self, identity: Identity) -> str | None:
-        """Why this agent is not wanted; None until the watch has its pod."""
+        """Return why an agent is refused; "" if it is admitted, None while its pod is unknown."""
         name = identity.name
         if name in self._given_up:
-            return f"{name}, which had been given up"
+            return f"{name}, which this program has released or lost"
         if (pod := self._pods.get(name)) is None:
             return None
         if pod["metadata"]["uid"] != identity.uid:
-            return f"{name}, which says that its pod has the uid {identity.uid!r}; it has another"
+            return f"{name}, whose pod has another uid than {identity.uid!r}"
         if pod_end(pod) is not None:
-            return f"{name}, whose pod is about to go"
+            return f"{name}, whose pod is ending"
         return ""
 
     def on_agent(self, link: Link) -> str | None:
-        """An agent has dialled; why it is not wanted, if it is not."""
+        """Add an agent that has dialed in; return a reason if it is refused."""
         name = link.peer.name
-        if (reason := self.objection(link.peer)) != "":  # it was welcome a moment ago
+        if (reason := self.objection(link.peer)) != "":  # it was admitted a moment ago
             return reason or f"{name}, whose pod is gone"
         if (before := self.agents.agents.get(name)) is not None:
-            # It had given this program up, ended its children, and is back: after a program was
-            # stopped for a while, say.
+            # The agent had lost this program, for example because that was stopped.  It has ended
+            # its children, and dials again.
             self._back_again = before
-            before.lose("it had lost this program, and began anew")
+            before.lose("it had lost this program and connected again")
         agent = self.agents.join(name, link)
         agent.pod = name
-        self._tell(agent)
+        self._describe(agent)
         return None
 
     def _lost(self, agent: RemoteAgent, reason: str) -> None:
         name = agent.host
         if agent is self._back_again:
-            return  # its pod is as good as before
+            return  # its pod stays in use
         if name in self._pods and name not in self._given_up and not self._closing.is_set():
-            # Its pod may live on where nobody hears it: another takes its place.
+            # The pod may still run, out of reach.  Another one takes its place.
             self._given_up.add(name)
             if self._client is not None:
                 self._client.demand(self._wanted, [name])
 
-    def _tell(self, agent: RemoteAgent) -> None:
-        """Say what is known of its pod, and of that pod's template."""
+    def _describe(self, agent: RemoteAgent) -> None:
+        """Give the agent the facts of its pod; retire it if the pod's template is outdated."""
         pod = self._pods.get(agent.host)
         if pod is None:
             return
         end = pod_end(pod)
-        agent.node = node_of(pod)
-        agent.ending = end.reason if end is not None else ""
-        agent.disrupted = end is not None and end.disrupted
+        reason = "" if end is None else end.reason
+        disrupted = end is not None and end.disrupted
+        agent.describe_pod(agent.host, node_of(pod), ending=reason, disrupted=disrupted)
         made_from = pod["metadata"]["labels"].get(names.LABEL_TEMPLATE_HASH)
         if self._waiting.status.get("templateHash", made_from) != made_from:
             self._retire(agent)
@@ -314,10 +318,10 @@ class Pods:
             self._demand.retire(agent)
             self._changed()
 
-    # -- What the API server says
+    # -- Events of the pool, as a ``PoolObserver``
 
     def on_pod(self, name: str, pod: Document | None) -> None:
-        """A pod of the pool, as it is now; None once it is gone."""
+        """Take a pod's present document; None once the pod is deleted."""
         agent = self.agents.agents.get(name)
         if pod is None:
             self._pods.pop(name, None)
@@ -330,24 +334,24 @@ class Pods:
         if is_new and self._prepared is not None:
             self._prepared.listener.look_again()
         if agent is not None:
-            self._tell(agent)
+            self._describe(agent)
             if (pod.get("status") or {}).get("phase") in _ENDED:
                 agent.lose("its pod has ended")
             elif pod["metadata"].get("deletionTimestamp"):
-                agent.leave(agent.ending)  # its SIGTERM may be late: a preStop hook comes before it
+                agent.leave(agent.ending)  # its SIGTERM comes after a preStop hook
             else:
                 self.agents.withhold(agent, bool(agent.ending), "ending")
 
     def on_status(self, status: Document) -> None:
-        """The pool's status, as it is now."""
+        """Take the pool's present status."""
         before = self._waiting.status
         self._waiting.on_status(status)
         if self._prepared is not None:
-            # Somebody else's pool keeps so many, unless it finds this program forgotten.
+            # A warm pool keeps so many, unless the operator has detached this program.
             self._demand.floor = min(self._prepared.min_pods, status.get("desiredReplicas") or 0)
         if before.get("templateHash") != status.get("templateHash"):
             for agent in self.agents.agents.values():
-                self._tell(agent)
+                self._describe(agent)
         self._changed()
 
     def connected(self) -> int:
@@ -355,34 +359,35 @@ class Pods:
         return len(self._placement.loads)
 
     def on_attached(self, epoch: int) -> None:
-        """The pool is there, with this program as its master."""
-        self._waiting.attached = True
+        """Note that the pool exists, with this program as its master."""
+        route = AgentRoute("")
         if (prepared := self._prepared) is not None:
             prepared.listener.epoch = epoch
-            self._waiting.way = AgentRoute(prepared.address, prepared.attachment.displaced)
+            route = AgentRoute(prepared.address, prepared.attachment.displaced)
+        self._waiting.on_attached(route)
 
     def on_lease_expired(self) -> None:
-        """Have the agents dial the pool's Service, which leads to its master of the moment."""
+        """Make the agents dial the pool's Service again, which leads to its present master."""
         if self._prepared is not None:
             self._prepared.listener.break_connections()
 
     def on_warning(self, message: str) -> None:
-        """Something that keeps the pool waiting, and may pass."""
+        """Report a problem of the pool that may pass."""
         self._output.write("fiber", message)
 
     def on_error(self, error: FiberPoolError) -> None:
         """Note that the pool has failed."""
-        # What works with one of our own goes on with another.  One that was lost before it was of
-        # any use would be made and lost again and again.
+        # Another pool follows a lost one of this program.  If no agent ever joined, it would be
+        # lost again, so none follows.
         self._goes_on = bool(self._successor and error.reason in LOST and self.agents.joined)
         if self._goes_on or not self._placement.waiting:
-            self._output.write("fiber", str(error))  # nobody else says it
+            self._output.write("fiber", str(error))  # no child reports it
         if not self._goes_on:
             self._waiting.refuse(error)
             self.agents.fail(error)
 
     def on_end(self) -> None:
-        """The pool is given back: whoever starts something now gets another."""
+        """End these pods: the pool was deleted or detached from.  New children get another one."""
         for agent in self.agents.agents.values():
             agent.close()
         if self._prepared is None:

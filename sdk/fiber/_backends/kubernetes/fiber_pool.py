@@ -1,4 +1,4 @@
-"""Life of one FiberPool, as the program that is its master sees it.
+"""Control of one FiberPool by the program that is its master.
 
 ``FiberPoolClient`` runs the thread of the pool. ``LeaseRenewer`` renews the master's Lease, which
 shows the operator that the program lives. ``Scaling`` writes the program's demand for workers to
@@ -36,17 +36,17 @@ from fiber.errors import FiberPoolError
 from fiber_api import names
 
 OPERATOR_SLOW, OPERATOR_ABSENT = 5.0, 30.0
-"""Seconds without a word from the operator until that is said, and until it is an error."""
+"""Seconds without a status from the operator until a warning, and until an error."""
 
 CLOSE_TIMEOUT = 10.0
-"""Seconds that the API server may take to give a pool back."""
+"""Seconds that the API server may take to delete a pool, or to detach from it."""
 
 _RENEW, _WATCH = "renew the Lease of", "watch"
 """Actions that may fail, in words that the name of the pool follows."""
 
 
 class AttachablePool(Protocol):
-    """Way in which a pool gets this program as its master, and in which that ends."""
+    """FiberPool that this program can become the master of: a new one, or a warm one."""
 
     name: str
     namespace: str
@@ -57,13 +57,13 @@ class AttachablePool(Protocol):
 
     @property
     def remedy(self) -> str:
-        """The command that does what ``detach`` could not."""
+        """Command for the user that does what ``detach`` could not."""
 
     def attach(self, cancel: threading.Event) -> AttachedPool:
         """Make this program the pool's master; ``ApiError``, FiberPoolError."""
 
     def detach(self, timeout: float) -> None:
-        """Undo it, whether or not ``attach`` succeeded; ``ApiError``."""
+        """Undo ``attach``, also if it failed halfway; ``ApiError``."""
 
 
 class PoolObserver(Protocol):
@@ -73,30 +73,31 @@ class PoolObserver(Protocol):
         """Return how many agents are linked; called on any thread."""
 
     def on_attached(self, epoch: int) -> None:
-        """Once: the pool is there, with this program as its master."""
+        """Note that the pool exists, with this program as its master.  Called once."""
 
     def on_status(self, status: Body) -> None:
-        """The pool's status, as it is now."""
+        """Take the pool's present status."""
 
     def on_pod(self, name: str, pod: Body | None) -> None:
-        """A pod of the pool, as it is now; None once it is gone."""
+        """Take a pod's present document; None once the pod is deleted."""
 
     def on_lease_expired(self) -> None:
-        """Another program may become the pool's master, and this one would not know."""
+        """Note that another program may become the pool's master unnoticed."""
 
     def on_warning(self, message: str) -> None:
-        """Something that keeps the pool waiting, and may pass."""
+        """Report a problem that may pass."""
 
     def on_error(self, error: FiberPoolError) -> None:
-        """Once: nothing comes of the pool any more."""
+        """Note that the pool has failed.  Called once at most."""
 
     def on_end(self) -> None:
-        """After that: the pool is given back, as at the end of the program."""
+        """Note that the failed pool was deleted or detached from."""
 
 
 class FiberPoolClient:
-    """Holds one pool, on the thread ``fiber-kubernetes``; its methods return at once, but for
-    ``close``.  Any thread may call them.
+    """Client that controls one pool, on the thread ``fiber-kubernetes``.
+
+    Any thread may call its methods.  All return at once, except ``close``.
     """
 
     def __init__(
@@ -124,20 +125,20 @@ class FiberPoolClient:
         self._generation = 0
         """Generation of the first spec with this program as its master."""
         self._observed = False
-        """The operator has seen the pool with this program as its master."""
+        """True once the operator has seen this program as the pool's master."""
         self._began = 0.0
-        """Since when the operator might have been heard."""
+        """Time since which a status of the operator could have arrived."""
         self._followers: list[Informer | LeaseRenewer] = []
         self._thread = threading.Thread(target=self._run, name="fiber-kubernetes", daemon=True)
 
     def start(self) -> None:
-        """Make the pool, or attach to it."""
+        """Start the thread, which makes the pool or attaches to it."""
         self._thread.start()
 
     def demand(self, replicas: int, release: Iterable[str] = ()) -> None:
-        """Have so many pods, and without those named in ``release``, which are fenced.
+        """Ask for ``replicas`` pods, and for the end of those named in ``release``.
 
-        Only the newest ``replicas`` counts; a name to release is remembered until its pod is gone.
+        Only the newest ``replicas`` counts.  A name to release is kept until its pod is gone.
         """
         self._scaling.want(replicas, release)
         self._wake.set()
@@ -150,15 +151,17 @@ class FiberPoolClient:
         self._wake.set()
 
     def close(self, timeout: float = CLOSE_TIMEOUT) -> None:
-        """Delete the pool, or detach from it.  Raises nothing but what signal handlers do: what
-        stays behind is said on stderr, with the command that removes it.
+        """Delete the pool, or detach from it.
+
+        Raises only what a signal handler raises.  If the API server does not answer, a line on
+        stderr says what is left, and the command that removes it.
         """
         self.begin_close(timeout)
         if self._thread.ident is None:
             return
         why = "the program was interrupted before the API server had answered"
         try:
-            # Not `join`, after which an interrupted one's thread counts as ended.
+            # Not ``join``: after an interrupted one, the thread would count as ended.
             if self._ended.wait(timeout + 1.0):
                 self._thread.join()
             why = f"the API server did not answer within {timeout:g} s"
@@ -167,7 +170,7 @@ class FiberPoolClient:
                 self._reporter.say_what_stays(why, self._attachment.remedy)
 
     def warn_anew(self) -> None:
-        """Somebody begins to wait, and is to be told what was told before, if it is still so."""
+        """Repeat the warnings of problems that persist, since children begin to wait."""
         self._reporter.warn_anew()
 
     # -- On the thread
@@ -185,7 +188,7 @@ class FiberPoolClient:
             follower.stop()
         try:
             self._attachment.detach(self._close_timeout)
-        except Exception as error:  # the program ends whatever comes
+        except Exception as error:  # no error may keep the program from ending
             self._reporter.say_what_stays(str(error), self._attachment.remedy)
         for follower in self._followers:
             follower.join(1.0)
@@ -231,18 +234,18 @@ class FiberPoolClient:
 
     def _serve(self, attached: AttachedPool) -> None:
         while not (self._closing.is_set() or self._over.is_set()):
-            pause = min(self._scaling.step(attached), self._miss_operator())
+            pause = min(self._scaling.step(attached), self._check_operator())
             self._wake.wait(None if pause == math.inf else pause)
             self._wake.clear()
 
-    def _miss_operator(self) -> float:
-        """Seconds until the operator's silence means more than now."""
+    def _check_operator(self) -> float:
+        """Warn or fail if the operator is silent; return the seconds until the next check."""
         if self._observed:
             return math.inf
         silent = time.monotonic() - self._began
         error = self._reporter.error(
             "NoOperator",
-            f"was not looked at by an operator for {silent:.0f} s. Look whether one runs and "
+            f"was not reconciled by an operator for {silent:.0f} s. Check that one runs and "
             "serves this namespace (`kubectl get deployments -A -l "
             "app.kubernetes.io/name=fiber-operator`), or install it: `helm install fiber-operator "
             "charts/fiber-operator -n fiber-system --create-namespace`",
@@ -254,11 +257,11 @@ class FiberPoolClient:
         self._reporter.warn("no operator", str(error))
         return OPERATOR_ABSENT - silent
 
-    # -- On the threads that follow it
+    # -- On the threads of the followers
 
     def _lease_expired(self, attached: AttachedPool, seconds: float) -> None:
         if not attached.kept_by_others:
-            return  # a pool of this program's own never has another master
+            return  # a pool that this program made never has another master
         self._reporter.expired(seconds)
         self._loop.call_soon(self._observer.on_lease_expired)
 
@@ -274,15 +277,15 @@ class FiberPoolClient:
             self._observed = True
             self._wake.set()
         self._reporter.answered()
-        if self._observed:  # else it may be about the master before
+        if self._observed:  # else the status may be about the master before
             self._loop.call_soon(self._observer.on_status, status)
 
     def _pool_trouble(self, error: ApiError) -> None:
         if isinstance(error, Forbidden) and not self._observed:
-            # Its status would never be known, and silence be taken for the operator's.
+            # Without a watch there is no status, and the operator would seem to be silent.
             self._reporter.refused(_WATCH, error)
             return
-        self._began = time.monotonic()  # of an operator nothing could be heard either
+        self._began = time.monotonic()  # a status of the operator could not arrive either
         self._reporter.trouble(_WATCH, error)
 
     def _pod_changed(self, name: str, pod: Body | None) -> None:
@@ -296,21 +299,21 @@ class FiberPoolClient:
 
 
 RENEWALS = 3
-"""Within one duration."""
+"""Number of renewals within one duration of the Lease."""
 
 _TIMEOUT = 1.0
-"""Seconds in which a connection that breaks is made again."""
+"""Seconds for one call."""
 
 _RETRY = 2.0
-"""Seconds after one that failed."""
+"""Seconds until the next attempt, after a failed one."""
 
 
 class LeaseRenewer:
-    """Renews the Lease of one pool, every third of its duration.
+    """Thread that renews the Lease of one pool, every third of its duration.
 
-    It does little, over a connection that stays open, so that an interpreter that is busy or held
-    by native code delays it as little as can be.  Where that, or a stopped process, took longer
-    than the duration the operator may have given the pool away: it looks before it goes on.
+    It does little work, so that a busy interpreter delays it little.  If the program was stopped or
+    blocked for longer than the duration, another program may be the master, so ``renew`` checks the
+    pool first.
     """
 
     def __init__(
@@ -324,12 +327,13 @@ class LeaseRenewer:
         on_fault: Callable[[Exception], None],
         now: Callable[[], float] = lambda: time.clock_gettime(time.CLOCK_BOOTTIME),
     ) -> None:
-        """The Lease is fresh.  Told on the thread: ``on_trouble`` what keeps it from being renewed,
-        each time; ``on_expired``, once in each duration that passes without a renewal, the seconds
-        since the last one.  And once, which ends the thread: ``on_lost`` that the pool is this
-        program's no more, ``on_refused`` that a login or a right has been missing for a whole
-        duration, ``on_fault`` of a fault of ours.  ``now`` counts seconds, a machine's sleep among
-        them.
+        """Prepare to renew a Lease that is new.  The functions are called on the thread.
+
+        ``on_trouble`` gets the error of each failed attempt.  ``on_expired`` gets the seconds since
+        the last renewal, once in each duration that passes without one.  One of the others ends the
+        thread: ``on_lost`` if the pool has another master or is deleted, ``on_refused`` if a login
+        or a right is missing for a whole duration, ``on_fault`` at a bug.  ``now`` counts seconds,
+        and also counts while the machine sleeps.
         """
         self._pool = pool
         self._on_lost = on_lost
@@ -340,18 +344,18 @@ class LeaseRenewer:
         self._now = now
         self._renewed = now()
         self._expires = self._renewed + pool.master.lease_duration
-        """Time at which the Lease runs out, as far as this program knows."""
+        """Time at which the Lease expires, as far as this program knows."""
         self._refused: float | None = None
         """Time of the first refusal.  A starting API server refuses everything for a while."""
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, name="fiber-lease", daemon=True)
 
     def start(self) -> None:
-        """Begin, on a thread of its own."""
+        """Start the thread."""
         self._thread.start()
 
     def stop(self) -> None:
-        """Renew no more; returns at once."""
+        """Stop renewing; return at once."""
         self._stopped.set()
 
     def join(self, timeout: float) -> None:
@@ -360,13 +364,13 @@ class LeaseRenewer:
             self._thread.join(timeout)
 
     def explain(self, error: FiberPoolError) -> FiberPoolError:
-        """``error``, which says that the pool is this program's no more, and why that may be."""
+        """Return ``error``, the loss of the pool, with the reason if the Lease had expired."""
         late = self._late()
         if late <= self._pool.master.lease_duration:
             return error
         return FiberPoolError(
-            f"{error}. This program did not renew its Lease for {late:.0f} s, and counts as gone "
-            f"after {self._pool.master.lease_duration} s: it was stopped, native code held its "
+            f"{error}. This program did not renew its Lease for {late:.0f} s, and counts as lost "
+            f"after {self._pool.master.lease_duration} s: it was stopped, native code blocked its "
             "interpreter, or the API server could not be reached",
             pool=error.pool,
             namespace=error.namespace,
@@ -374,7 +378,7 @@ class LeaseRenewer:
         )
 
     def renew(self) -> None:
-        """Once; FiberPoolError if the pool is this program's no more."""
+        """Renew the Lease once; FiberPoolError if the pool was lost."""
         now = self._now()
         if self._late() > self._pool.master.lease_duration:
             self._pool.check()
@@ -398,7 +402,7 @@ class LeaseRenewer:
             self._on_fault(error)
 
     def _attempt(self) -> float:
-        """Seconds until the next one."""
+        """Renew the Lease; return the seconds until the next attempt."""
         pause = self._pool.master.lease_duration / RENEWALS
         try:
             self.renew()
@@ -408,7 +412,7 @@ class LeaseRenewer:
             self._on_trouble(error)
             self._notice_expiry()
             asked = error.retry_after if isinstance(error, Transient) else 0.0
-            return max(_RETRY, min(asked, pause))  # who lives must be heard in time all the same
+            return max(_RETRY, min(asked, pause))  # in time, also if the server asks for longer
         self._refused = None
         return pause
 
@@ -430,29 +434,29 @@ class LeaseRenewer:
         return self._now() - self._renewed
 
     def _make(self) -> None:
-        """Somebody deleted it, or all of the pool."""
+        """Make the Lease, which was deleted; FiberPoolError if the pool was deleted too."""
         self._pool.check()
         try:
             self._pool.make_lease(timeout=_TIMEOUT)
         except Conflict:
-            pass  # it is there again
+            pass  # it exists again
 
 
 PATCH_INTERVAL = 1.0
-"""Seconds from one change to the next, so that a demand that moves is not a flood of patches."""
+"""Seconds between two patches, so that a changing demand makes few of them."""
 
 REFUSED = 30.0
-"""Seconds that a login or a right may be missing that was there before."""
+"""Seconds for which a login or a right may be missing."""
 
 
 _PAUSE_MIN, _PAUSE_MAX = 0.2, 5.0
-"""Seconds after an attempt that failed, growing."""
+"""Seconds until the next attempt, after a failed one; growing."""
 
 
 class Scaling:
-    """The newest demand, written at once, then once a second at most, and again until it holds.
+    """Writer of the newest demand to the pool: at most once a second, repeated after failures.
 
-    ``want`` and ``gone`` are for any thread, ``step`` for one.
+    Any thread may call ``want`` and ``gone``.  One thread calls ``step``.
     """
 
     def __init__(
@@ -460,7 +464,7 @@ class Scaling:
         on_trouble: Callable[[ApiError], None],
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        """``on_trouble`` is told what keeps a demand from being written, each time."""
+        """``on_trouble`` gets the error of each failed attempt."""
         self._on_trouble = on_trouble
         self._now = now
         self._lock = threading.Lock()
@@ -469,21 +473,21 @@ class Scaling:
         self._release: dict[str, None] = {}
         """Pods to release, in order.  At most MAX_RELEASE of them go at a time."""
         self._gone: set[str] = set()
-        """Pods that were there.  A name is never used again."""
+        """Deleted pods.  A name is never used again."""
         self._due = 0.0
         self._pause = _PAUSE_MIN
         self._refused: float | None = None
-        """Since when."""
+        """Time of the first refusal in a row; None if there is none."""
 
     def want(self, replicas: int, release: Iterable[str]) -> None:
-        """From now on; names to release are added to those of before."""
+        """Set the number of pods; add names to those that are to be released."""
         with self._lock:
             self._replicas = replicas
             self._release.update((name, None) for name in release if name not in self._gone)
             self._changed = True
 
     def gone(self, name: str) -> bool:
-        """The pod is there no more; whether there is a name now that can take its place."""
+        """Note that a pod is deleted; return whether another name can be released now."""
         with self._lock:
             self._gone.add(name)
             if name not in self._release:
@@ -494,9 +498,9 @@ class Scaling:
             return waiting
 
     def step(self, pool: AttachedPool) -> float:
-        """Write what is due; seconds until the next step is.
+        """Write what is due; return the seconds until the next step.
 
-        ``ApiError`` and FiberPoolError where that will never succeed.
+        ``ApiError`` or FiberPoolError: writing will never succeed.
         """
         now = self._now()
         if now < self._due:
@@ -521,7 +525,7 @@ class Scaling:
         except (Forbidden, Unauthorized, Transient):
             raise
         except ApiError:
-            pool.check()  # another's by now, or deleted: that says more
+            pool.check()  # if the pool was lost, that error says more
             raise
 
     def _put_off(self, error: ApiError) -> bool:

@@ -1,4 +1,4 @@
-"""A thread that knows how some objects of the API server are: a pool, or its pods."""
+"""Thread that follows the state of some objects of the API server: a pool, or its pods."""
 
 from __future__ import annotations
 
@@ -10,18 +10,20 @@ from collections.abc import Callable, Iterable, Mapping
 from fiber._backends.kubernetes.api import Api, ApiError, Body, Expired, Transient, Watch
 
 _PAUSE_MIN, _PAUSE_MAX = 0.1, 5.0
-"""Seconds before it goes on after an end that came early, growing."""
+"""Seconds until the next watch after one that ended early; growing."""
 
 _EARLY = 1.0
-"""A watch that ends sooner, in seconds, is not followed by the next one at once."""
+"""Seconds.  After a watch that ends sooner, the next one begins with a pause."""
 
 _PAGE = 50
-"""Objects of one answer.  Parsing holds the interpreter, and a thousand pods are several MB."""
+"""Objects in one answer.  Parsing blocks other threads, and a thousand pods are several MB."""
 
 
 class Informer:
-    """Lists once, then watches; where a watch ends the next goes on, and where that cannot be it
-    lists again and tells what is different from before.
+    """Follower of objects, which lists them once and then watches.
+
+    After the end of a watch the next one continues.  If it cannot, the informer lists again and
+    reports the differences.
     """
 
     def __init__(
@@ -35,11 +37,12 @@ class Informer:
         on_trouble: Callable[[ApiError], None],
         on_fault: Callable[[Exception], None],
     ) -> None:
-        """``known`` names what was there before: it is told if it is there no more.
+        """Prepare to follow the objects at ``path``.  The functions are called on the thread.
 
-        ``on_change`` is told the name and the object as it is, or None once it is gone;
-        ``on_trouble`` what keeps the watch from going on, while it does; ``on_fault`` of a fault of
-        ours, which ends it.  All on the thread.
+        ``known``: names of objects that existed before; if one is missing, that is reported.
+        ``on_change`` gets a name and the present object, or None once it is deleted.
+        ``on_trouble`` gets errors that keep the watch from continuing.  ``on_fault`` gets a bug,
+        which ends the thread.
         """
         self._api = api
         self._path = path
@@ -48,10 +51,10 @@ class Informer:
         self._on_trouble = on_trouble
         self._on_fault = on_fault
         self._version: str | None = None
-        """Version from which the next watch goes on; None: begin with a list."""
+        """Version from which the next watch continues; None: begin with a list."""
         self._known = set(known)
         self._failed = False
-        """The last attempt brought nothing."""
+        """True if the last attempt brought nothing."""
         self._lock = threading.Lock()
         self._watch: Watch | None = None
         self._stopped = threading.Event()
@@ -59,11 +62,11 @@ class Informer:
         self._thread = threading.Thread(target=self._run, name=f"fiber-watch-{kind}", daemon=True)
 
     def start(self) -> None:
-        """Begin, on a thread of its own."""
+        """Start the thread."""
         self._thread.start()
 
     def stop(self) -> None:
-        """Tell nothing more; returns at once."""
+        """Report no more changes; return at once."""
         with self._lock:
             self._stopped.set()
             watch = self._watch
@@ -91,7 +94,7 @@ class Informer:
             self._on_fault(error)
 
     def _attempt(self) -> float:
-        """Go on for as long as it goes; the seconds that the API server then asks to wait."""
+        """List and watch until the watch ends; return the seconds that the server asks to wait."""
         try:
             if self._version is None:
                 self._version = self._list()
@@ -99,7 +102,7 @@ class Informer:
         except Expired:
             self._version = None
         except ApiError as error:
-            # A connection that breaks once is nothing to speak of: it is made again.
+            # A connection that breaks once is not reported: it is made again.
             if self._failed or not isinstance(error, Transient):
                 self._on_trouble(error)
             self._failed = True
@@ -115,13 +118,13 @@ class Informer:
             page = {"limit": str(_PAGE), **({"continue": rest} if rest else {})}
             listing = self._api.list(self._path, {**self._selector, **page}, timeout=0.0)
             found |= {str(item["metadata"]["name"]): item for item in listing.get("items") or ()}
-            # The first page's: whatever changes while the others are read is told once more.
+            # The version of the first page: changes during the other pages are reported again.
             version = version or str(listing["metadata"]["resourceVersion"])
             rest = listing["metadata"].get("continue") or ""
         for name in sorted(self._known - found.keys()):
-            self._tell(name, None)
+            self._report(name, None)
         for name, item in found.items():
-            self._tell(name, item)
+            self._report(name, item)
         return version
 
     def _follow(self, version: str) -> None:
@@ -134,10 +137,10 @@ class Informer:
             found = event["object"]
             if event["type"] != "BOOKMARK":
                 name = str(found["metadata"]["name"])
-                self._tell(name, None if event["type"] == "DELETED" else found)
+                self._report(name, None if event["type"] == "DELETED" else found)
             self._version = str(found["metadata"]["resourceVersion"])
 
-    def _tell(self, name: str, found: Body | None) -> None:
+    def _report(self, name: str, found: Body | None) -> None:
         self._failed = False
         if self._stopped.is_set():
             return

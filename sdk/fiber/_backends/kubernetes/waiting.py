@@ -1,9 +1,10 @@
 """Children that wait for a pod.
 
 * ``Preparation`` makes the FiberPool on a thread, because that waits for the API server.
-* ``WaitingChildren`` holds the children until an agent arrives or the time for that is over.
+* ``WaitingChildren`` ends the wait of children for which no agent can come.
 * ``Progress`` shows on stderr what the children wait for.
-* ``ReachabilityProbe`` tells when running pods send no agent.  It is pure: ``now`` is an argument.
+* ``ReachabilityProbe`` concludes that running pods cannot reach the program.  It is pure: ``now``
+  is an argument.
 """
 
 from __future__ import annotations
@@ -36,9 +37,9 @@ from fiber.errors import FiberError
 
 
 class WaitingChildren:
-    """The children of one FiberPool that have no agent yet.  On the loop's thread.
+    """Children of one FiberPool that have no agent yet.  Runs on the loop's thread.
 
-    ``on_begin`` is called as somebody begins to wait while there is no agent at all.
+    ``on_begin`` is called when children begin to wait while the pool has no agent.
     """
 
     def __init__(
@@ -51,40 +52,49 @@ class WaitingChildren:
         on_begin: Callable[[], None],
     ) -> None:
         self.pool = PoolName("", "")
-        """Pool that they wait for, once it has a name."""
-        self.way = AgentRoute("")
-        """Way of its agents to this program, once it has a name."""
+        """Pool that the children wait for; without a name before ``on_named``."""
+        self.route = AgentRoute("")
+        """Route of agents to this program; empty before ``on_attached``."""
         self.status: Mapping[str, Any] = {}
         """Present status of the pool."""
         self.attached = False
-        """True if the pool is there, with this program as its master."""
+        """True if the pool exists, with this program as its master."""
         self._output = output
         self._api = api
         self._agents = agents
         self._placement = agents.placement
         self._timeout = timeout
         self._on_begin = on_begin
-        self._patience: ScheduledCall | None = None
+        self._timeout_timer: ScheduledCall | None = None
         self._reachability = ReachabilityProbe()
         self._verdict = Reachability.OPEN
-        self._told_of_verdict = False
+        self._verdict_reported = False
         self._next_judgement: ScheduledCall | None = None
-        self._told_of_limit = False
+        self._limit_reported = False
         self._progress = Progress(agents.loop, output, self._describe)
 
     def stop(self) -> None:
         """End the waiting."""
         self._progress.stop()
-        self._wait_no_more()
+        self._cancel_timeout()
         self._cancel_judgement()
 
-    def _wait_no_more(self) -> None:
-        if self._patience is not None:
-            self._patience.cancel()
-            self._patience = None
+    def _cancel_timeout(self) -> None:
+        if self._timeout_timer is not None:
+            self._timeout_timer.cancel()
+            self._timeout_timer = None
+
+    def on_named(self, pool: PoolName) -> None:
+        """Take the name of the pool that the children wait for."""
+        self.pool = pool
+
+    def on_attached(self, route: AgentRoute) -> None:
+        """Note that the pool exists, with this program as its master."""
+        self.attached = True
+        self.route = route
 
     def on_status(self, status: Mapping[str, Any]) -> None:
-        """Say what is new in the pool's status, and end the wait if nobody will come."""
+        """Report new problems in the pool's status; end the wait if no agent will come."""
         before, self.status = self.status, status
         for problem in new_problems(self.pool, before, status):
             self._output.write("fiber", problem)
@@ -94,38 +104,38 @@ class WaitingChildren:
         self._judge_reachability()
 
     def reached(self) -> None:
-        """Note that an agent of the pool has dialled: pods reach this program."""
+        """Note that an agent of the pool has dialed: pods reach this program."""
         self._reachability.prove()
         self._judge_reachability()
 
     def refuse(self, error: Exception) -> None:
-        """Refuse all that wait with ``error``."""
-        self._progress.stop()  # first: whoever is refused may write where its line stands
+        """Refuse all waiting children with ``error``."""
+        self._progress.stop()  # first: an observer may write where the status line is
         if self._has_processes:
-            # Whoever started it has gone on.  Pools raise it to their callers.
+            # No caller waits for the start of a process.  Pools raise the error to their callers.
             self._output.write("fiber", str(error))
         self._agents.refuse_waiting(error)
 
     def look(self, most: int) -> None:
-        """Somebody has come or gone; there are to be at most so many pods."""
+        """Check the waiting children after a change, with ``most`` pods at most."""
         placement = self._placement
         alone = self._alone
         known = self._agents.error or failure(self.pool, self.status, 0) or self._unreachable()
         if alone and known is not None:
-            self.refuse(known)  # it was heard before they came
+            self.refuse(known)  # the error was known before these children came
             return
-        self._tell_of_doubts()
+        self._report_doubts()
         if self.pool.name:
             self._look_at_limit(most)
-        # A pool works with the workers that it has: nobody waits for the others.
+        # A pool works with the workers that it has, and waits for no others.
         if alone or (len(placement.loads) < most and self._has_processes):
             self._progress.start()
         else:
             self._progress.stop()
         if not alone:
-            self._wait_no_more()
-        elif self._patience is None:
-            self._patience = self._agents.loop.call_later(self._timeout, self._give_up)
+            self._cancel_timeout()
+        elif self._timeout_timer is None:
+            self._timeout_timer = self._agents.loop.call_later(self._timeout, self._give_up)
             self._on_begin()
 
     @property
@@ -139,20 +149,21 @@ class WaitingChildren:
         return not all(child.is_worker for child in self._placement.waiting)
 
     def _look_at_limit(self, most: int) -> None:
-        """Processes for which there is no room in ``most`` pods until others end are spoken of,
-        once: these may wait for them.
+        """Report once that processes wait until others end, since ``most`` pods are full.
+
+        The running processes may wait for the waiting ones, without an end.
         """
         placement = self._placement
         too_many = placement.children + len(placement.waiting) > most * placement.slots
         if not too_many:
-            self._told_of_limit = False
-        elif not self._told_of_limit and self._has_processes:
-            self._told_of_limit = True
+            self._limit_reported = False
+        elif not self._limit_reported and self._has_processes:
+            self._limit_reported = True
             self._output.write(
                 "fiber",
-                f"{len(placement.waiting)} processes wait until others end: there are to be no "
-                f"more than {most} pods with {placement.slots} processes each. Raise max_pods, for "
-                "a pool of somebody else's its maxReplicas, or processes_per_pod",
+                f"{len(placement.waiting)} processes wait until others end: at most {most} pods "
+                f"with {placement.slots} processes each are allowed. Raise max_pods or "
+                "processes_per_pod; for an existing FiberPool, raise its maxReplicas",
             )
 
     def _judge_reachability(self) -> None:
@@ -160,7 +171,7 @@ class WaitingChildren:
         self._cancel_judgement()
         self._verdict = self._reachability.judge(running(self.status), now := loop.now())
         if self._verdict is Reachability.OPEN:
-            self._told_of_verdict = False
+            self._verdict_reported = False
         if self._reachability.due < math.inf:
             pause = self._reachability.due - now
             self._next_judgement = loop.call_later(pause, self._judge_reachability)
@@ -168,7 +179,7 @@ class WaitingChildren:
         if error is not None and self._alone:
             self.refuse(error)
         else:
-            self._tell_of_doubts()
+            self._report_doubts()
 
     def _cancel_judgement(self) -> None:
         if self._next_judgement is not None:
@@ -176,60 +187,59 @@ class WaitingChildren:
             self._next_judgement = None
 
     def _unreachable(self) -> FiberError | None:
-        # The agents of a pool that was taken over may serve its last master, for as long as that
-        # lives.
-        if self._verdict is not Reachability.UNREACHABLE or self.way.displaced:
+        # The agents of a pool that was taken over may still serve the master before.
+        if self._verdict is not Reachability.UNREACHABLE or self.route.displaced:
             return None
-        return unreachable(self.pool, self.status, DOUBTED_AFTER + GIVEN_UP_AFTER, self.way)
+        return unreachable(self.pool, self.status, DOUBTED_AFTER + GIVEN_UP_AFTER, self.route)
 
-    def _tell_of_doubts(self) -> None:
-        if self._verdict is Reachability.OPEN or self._told_of_verdict or not self._alone:
+    def _report_doubts(self) -> None:
+        if self._verdict is Reachability.OPEN or self._verdict_reported or not self._alone:
             return
-        self._told_of_verdict = True
-        doubt = unreachable(self.pool, self.status, DOUBTED_AFTER, self.way)
-        patience = "" if self.way.displaced else f". Waiting for {GIVEN_UP_AFTER:g} s more"
+        self._verdict_reported = True
+        doubt = unreachable(self.pool, self.status, DOUBTED_AFTER, self.route)
+        patience = "" if self.route.displaced else f". Waiting for {GIVEN_UP_AFTER:g} s more"
         self._output.write("fiber", f"{doubt}{patience}")
 
     def _give_up(self) -> None:
-        self._patience = None
+        self._timeout_timer = None
         if self.pool.name:
-            error = overdue(self.pool, self.status, self._timeout, time.time(), self.way)
+            error = overdue(self.pool, self.status, self._timeout, time.time(), self.route)
             self.refuse(error)
         else:
             self.refuse(
                 FiberError(
-                    f"no pod could be asked for within {self._timeout:g} s: {self._api_state()}. "
-                    "Look with `kubectl get fiberpools` whether it answers, and whether its login "
-                    "waits for somebody"
+                    f"no pod could be requested within {self._timeout:g} s: {self._api_state()}. "
+                    "Check with `kubectl get fiberpools` that the API server answers and that the "
+                    "login needs no input"
                 )
             )
 
     def _describe(self) -> str:
         state = summary(self.status, time.time()) if self.attached else self._api_state()
         unreached = self._verdict is not Reachability.OPEN
-        where = f", no agent has reached {self.way.address}" if unreached else ""
+        where = f", no agent has reached {self.route.address}" if unreached else ""
         return f"waiting for pods: {state}{where}"
 
     def _api_state(self) -> str:
         trouble = self._api.trouble
         if trouble is None:
             return f"the API server {self._api.server} has not answered yet"
-        return f"the API server {self._api.server} is asked again and again: {trouble}"
+        return f"calls to the API server {self._api.server} fail and are repeated: {trouble}"
 
 
 _FIRST_SHOWN, _SHOWN_AGAIN = 1.0, 1.0
-"""Seconds on a terminal, where each line takes the place of the one before."""
+"""Seconds on a terminal, where each status replaces the one before."""
 
 _FIRST_WRITTEN, _WRITTEN_AGAIN = 5.0, 60.0
-"""Seconds elsewhere, where lines stay."""
+"""Seconds elsewhere, where each status is a line that stays."""
 
 _COLUMNS = 80
 
 
 class Progress:
-    """Says what ``describe()`` does, again and again while a wait lasts.
+    """Display of ``describe()`` on stderr, repeated while a wait lasts.
 
-    On the loop's thread.
+    Runs on the loop's thread.
     """
 
     def __init__(self, loop: EventLoop, output: OutputWriter, describe: Callable[[], str]) -> None:
@@ -240,42 +250,42 @@ class Progress:
         self._shows = False
 
     def start(self) -> None:
-        """The wait begins, or goes on."""
+        """Begin or continue the display."""
         if self._timer is None:
             self._shows = _is_terminal()
             first = _FIRST_SHOWN if self._shows else _FIRST_WRITTEN
-            self._timer = self._loop.call_later(first, self._say)
+            self._timer = self._loop.call_later(first, self._show)
 
     def stop(self) -> None:
-        """End the waiting: remove the line from a terminal."""
+        """End the display; remove it from a terminal."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
             if self._shows:
                 self._output.show("")
 
-    def _say(self) -> None:
+    def _show(self) -> None:
         text = self._describe()
         if self._shows:
-            # A line that wraps cannot be taken away.
+            # A line that wraps cannot be erased.
             self._output.show(f"[fiber] {text}"[: _columns() - 1])
         else:
             self._output.write("fiber", text)
         again = _SHOWN_AGAIN if self._shows else _WRITTEN_AGAIN
-        self._timer = self._loop.call_later(again, self._say)
+        self._timer = self._loop.call_later(again, self._show)
 
 
 def _is_terminal() -> bool:
     try:
         return sys.stderr.isatty()
-    except (AttributeError, ValueError):  # there is none, or it is closed
+    except (AttributeError, ValueError):  # stderr is None or closed
         return False
 
 
 def _columns() -> int:
     try:
         return os.get_terminal_size(sys.stderr.fileno()).columns or _COLUMNS
-    except (AttributeError, OSError, ValueError):  # some terminals do not say
+    except (AttributeError, OSError, ValueError):  # some terminals have no known size
         return _COLUMNS
 
 
@@ -288,11 +298,11 @@ GIVEN_UP_AFTER = 60.0
 
 _LATE = 2.0
 """Seconds by which a judgement may be late.  A longer delay means that this program was stopped or
-held up, and that agents had to wait for it."""
+blocked, and that agents had to wait for it."""
 
 
 class Reachability(enum.Enum):
-    """Conclusion from running pods that send no agent."""
+    """Conclusion from running pods whose agents do not dial."""
 
     OPEN = enum.auto()
     DOUBTFUL = enum.auto()
@@ -300,7 +310,7 @@ class Reachability(enum.Enum):
 
 
 class ReachabilityProbe:
-    """Record of the running pods of one pool, and of the first sign of an agent."""
+    """Record of the running pods of one FiberPool, and of the first agent that dialed."""
 
     def __init__(self) -> None:
         self.due = math.inf
@@ -316,7 +326,7 @@ class ReachabilityProbe:
         self.due = math.inf
 
     def judge(self, running: int, now: float) -> Reachability:
-        """Return the conclusion, with ``running`` pods there now."""
+        """Return the conclusion, with ``running`` pods at ``now``."""
         late, self.due = now > self.due + _LATE, math.inf
         if not running or self._proven:
             self._running = 0
@@ -324,7 +334,7 @@ class ReachabilityProbe:
         if not self._running or late:
             self._since = now
         if running > self._running or late:
-            self._newest = now  # as much time for this pod's agent as for the first
+            self._newest = now  # the agent of a new pod gets as much time as the first
         self._running = running
         doubted_at = self._since + DOUBTED_AFTER
         given_up_at = max(doubted_at + GIVEN_UP_AFTER, self._newest + DOUBTED_AFTER)
@@ -335,8 +345,9 @@ class ReachabilityProbe:
 
 
 class Preparation:
-    """Calls ``prepare`` once, and on the loop's thread ``on_prepared`` with what it returns or
-    ``on_failed`` with what it raises.
+    """Thread that calls ``prepare`` once.
+
+    On the loop's thread, ``on_prepared`` gets its result, or ``on_failed`` its error.
     """
 
     def __init__(
@@ -354,14 +365,14 @@ class Preparation:
         self._thread = threading.Thread(target=self._run, name="fiber-prepare", daemon=True)
 
     def start(self) -> None:
-        """Begin.  On the loop's thread."""
+        """Start the thread.  Runs on the loop's thread."""
         try:
             self._thread.start()
-        except RuntimeError as error:  # the system has no room for it
+        except RuntimeError as error:  # the system has no room for a thread
             self._on_failed(_unexpected(error))
 
     def join(self, timeout: float) -> None:
-        """Wait until it is over."""
+        """Wait until ``prepare`` has ended."""
         self._thread.join(timeout)
 
     def _run(self) -> None:
@@ -369,13 +380,13 @@ class Preparation:
             prepared = self._prepare()
         except FiberError as error:
             self._loop.call_soon(self._on_failed, error)
-        except Exception as error:  # a fault of ours must not leave anybody waiting
+        except Exception as error:  # a bug must not leave children waiting
             self._loop.call_soon(self._on_failed, _unexpected(error))
         else:
             self._loop.call_soon(self._on_prepared, prepared)
 
 
 def _unexpected(error: Exception) -> FiberError:
-    failure = FiberError(f"no pods can be asked for, after an unexpected {error!r}")
+    failure = FiberError(f"no pods can be requested, after an unexpected {error!r}")
     failure.__cause__ = error
     return failure
