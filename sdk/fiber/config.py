@@ -23,7 +23,7 @@ from dataclasses import dataclass, field, fields, replace
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypedDict, Unpack, get_args
 
-from fiber import _config_sources, _wishes
+from fiber import _config_sources, resources
 from fiber.errors import ConfigError
 
 __all__ = ["Config", "current", "guard", "init", "install", "load", "use"]
@@ -131,14 +131,14 @@ def _amount(expects: str, read: Callable[[object], object], *, or_none: bool) ->
 
 def _node_selector() -> _Rule:
     def check(value: object) -> dict[str, str]:
-        return dict(_wishes.node_selector(value))
+        return dict(resources.read_node_selector(value))
 
     return _Rule("a dict of the labels of nodes, or a text as 'disk=ssd,zone=a'", check)
 
 
 def _tolerations() -> _Rule:
     def check(value: object) -> tuple[dict[str, Any], ...]:
-        return tuple(dict(one) for one in _wishes.tolerations(value))
+        return tuple(dict(one) for one in resources.read_tolerations(value))
 
     return _Rule("a list of tolerations, or a text as 'spot,team=a:NoSchedule'", check)
 
@@ -243,14 +243,14 @@ class Config:
     pool: str | None = _key(None, _pool(), fixed=True)
     processes_per_pod: int = _key(1, _whole(1, 1024), fixed=True)
     cpu_request: float = _key(
-        0.05, _amount("CPUs, as 0.5 or '500m'", _wishes.cpus, or_none=True), fixed=True
+        0.05, _amount("CPUs, as 0.5 or '500m'", resources.read_cpus, or_none=True), fixed=True
     )
     memory_request: int = _key(
-        64, _amount("MiB, or a text as '512Mi'", _wishes.mebibytes, or_none=True), fixed=True
+        64, _amount("MiB, or a text as '512Mi'", resources.read_mebibytes, or_none=True), fixed=True
     )
     shm: int | None = _key(
         None,
-        _amount("MiB above 0, or a text as '2Gi'", _wishes.mebibytes, or_none=False),
+        _amount("MiB above 0, or a text as '2Gi'", resources.read_mebibytes, or_none=False),
         fixed=True,
     )
     node_selector: Mapping[str, str] | None = _key(None, _node_selector(), fixed=True)

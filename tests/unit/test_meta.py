@@ -318,7 +318,7 @@ class TestNodes:
         ("wishes", "why"),
         [
             ({"resources": {"cpu": 1}}, "CPUs and memory are cpu= and memory="),
-            ({"resources": {"nvidia.com/gpu": 1}}, "use that"),
+            ({"resources": {"nvidia.com/gpu": 1}}, "use gpu= instead"),
             ({"resources": {"amd.com/gpu": 0.5}}, "a whole number"),
             ({"node_selector": {"disk": 1}}, "a dict of labels"),
             ({"tolerations": ["spot:Never"]}, "is no toleration"),

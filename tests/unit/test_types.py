@@ -163,7 +163,7 @@ def test_init_has_a_typed_keyword_for_each_key() -> None:
     (settings,) = (
         node
         for node in ast.walk(tree)
-        if isinstance(node, ast.ClassDef) and node.name == "Settings"
+        if isinstance(node, ast.ClassDef) and node.name == "ConfigKeywords"
     )
     typed = {
         entry.target.id: ast.unparse(entry.annotation)

@@ -22,10 +22,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import fiber
-from fiber._wishes import GPU
 from fiber.config import Config
 from fiber.errors import ConfigError
-from fiber.resources import Resources, merged, wished
+from fiber.resources import GPU, Resources, merged, wished
 from fiber_api import names
 
 Document = dict[str, Any]
