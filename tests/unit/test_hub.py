@@ -181,7 +181,7 @@ def test_without_a_hub_the_error_says_what_to_do(monkeypatch: pytest.MonkeyPatch
     for name in ("_local_hub", "_address", "_starter"):
         monkeypatch.setattr(client, name, None)
     for shared in (fiber.Pipe()[1], fiber.SimpleQueue()):
-        with pytest.raises(NoHub, match=r"queue, lock, value .* Start a process or pool first"):
+        with pytest.raises(NoHub, match=r"queue, lock or other .* Start a process or pool first"):
             pickle.dumps(shared)
 
 

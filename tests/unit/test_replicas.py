@@ -189,9 +189,7 @@ def replicas(hosts: Hosts) -> Iterator[Replicas]:
         yield hub.replicas
 
 
-@pytest.mark.parametrize(
-    ("home", "reason"), [("a", "not there any more"), ("c", "'c' cannot be reached")]
-)
+@pytest.mark.parametrize(("home", "reason"), [("a", "is gone"), ("c", "'c' cannot be reached")])
 def test_who_may_not_have_it_is_told_why(replicas: Replicas, home: str, reason: str) -> None:
     asker = Asker()
     origin = Origin(home, NO_SECRET, 8, NO_SECRET, NO_SECRET)
@@ -210,7 +208,7 @@ def test_what_others_have_is_not_had_without_its_secrets(far: Far, hosts: Hosts)
         wrong = Origin("a", NO_SECRET, replica.block.size, NO_SECRET, NO_SECRET)
         hosts.on_loop(replicas.join, wrong, asker, asker)
         assert wait_until(lambda told=asker: bool(told.reason), PATIENCE)
-        assert "not there any more" in asker.reason
+        assert "is gone" in asker.reason
     assert list(other) == [0, 0, 0]
 
 

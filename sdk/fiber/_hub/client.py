@@ -1,7 +1,8 @@
-"""Access of this process to its hub, and by streams through it to other hubs.
+"""Access of this process to its hub, and through it to other hubs.
 
-The hub lives in the agent of its host.  The processes that the agent starts are told its address
-and key when they are born.  A stream blocks, and is for one thread at a time.
+The hub is a part of the agent of its host.  A process that the agent starts gets the hub's address
+and key with its start message.  A process talks to hubs by streams.  A stream blocks, and is
+for one thread at a time.
 """
 
 from __future__ import annotations
@@ -28,14 +29,14 @@ _FORMS = {form.size: form for form in (HEAD, ONE, SECRETS)}
 
 
 class NoHub(FiberError, OSError):
-    """A handle has to leave this process and no hub is there to keep what it stands for."""
+    """Error: a handle cannot leave this process, because no hub can keep its object."""
 
 
 class ObjectUnreachable(ConnectionClosed):
-    """An object of some hub that cannot be used any more, or never could; says why."""
+    """Error: an object at a hub cannot be used.  The text says why."""
 
     def __init__(self, host: str, reason: str) -> None:
-        EOFError.__init__(self, f"what is kept on host {host!r} cannot be used: {reason}")
+        EOFError.__init__(self, f"an object on host {host!r} cannot be used: {reason}")
         self.peer = f"host {host!r}"
         self.reason = reason
 
@@ -44,7 +45,10 @@ class ObjectUnreachable(ConnectionClosed):
 
 
 class LocalHub(Protocol):
-    """A hub that lives in this process."""
+    """Hub in this process.
+
+    ``Hub`` implements it.  This module stands below ``Hub`` and cannot import it.
+    """
 
     host: str
     key: bytes
@@ -57,44 +61,44 @@ class LocalHub(Protocol):
 
     @property
     def known_address(self) -> HubAddress | None:
-        """The same, if anybody was told yet."""
+        """Address of the hub if another process has it, else None."""
 
     def dial(self) -> socket.socket:
-        """A stream to it."""
+        """Return the socket of a new stream to this hub."""
 
     def fetch(self, grant: bytes) -> list[Descriptor]:
-        """The descriptors of an object that it keeps."""
+        """Return the descriptors of the object of a grant."""
 
     def on_loop(self) -> bool:
         """Tell whether the caller runs on the thread that serves the hub."""
 
 
 def set_hub_address(address: HubAddress) -> None:
-    """Note the address of this host's hub, which another process has."""
+    """Set the address of this host's hub, which is in another process."""
     global _address, _local_hub
     _address, _local_hub = address, None
 
 
 def set_local_hub(hub: LocalHub | None) -> None:
-    """Note that this process has the hub of its host; None: it has ended."""
+    """Set the hub of this host, which is in this process.  None: it has ended."""
     global _local_hub
     _local_hub = hub
 
 
 def set_hub_starter(starter: Callable[[], object]) -> None:
-    """Set the function that makes a runtime with a hub, for a program that needs one."""
+    """Set the function that starts a runtime with a hub when a program first needs one."""
     global _starter
     _starter = starter
 
 
 def local_hub() -> LocalHub | None:
-    """The hub, if it lives in this process; made now if this process is to have one."""
+    """Return the hub if it is in this process, else None.  Start it in a new program."""
     if _local_hub is None and _address is None:
         if _starter is None:
             raise NoHub(
-                "what processes share (a pipe, queue, lock, value and so on) cannot leave this "
-                "process: nothing of Fiber runs here that could keep it for the other side. Start "
-                "a process or pool first."
+                "a pipe, queue, lock or other shared object cannot leave this process: no hub of "
+                "Fiber runs here that could keep it for the receiver. Start a process or pool "
+                "first."
             )
         _starter()
     return _local_hub
@@ -112,7 +116,7 @@ def hub_address() -> HubAddress:
 
 
 def host() -> str:
-    """The name of this host."""
+    """Return the name of this host."""
     hub = local_hub()
     if hub is not None:
         return hub.host
@@ -121,21 +125,21 @@ def host() -> str:
 
 
 def inherited_address() -> HubAddress | None:
-    """The hub's address, if this process was told it when it was born."""
+    """Return the hub's address if this process got it at its start, else None."""
     return _address
 
 
 def _refuse_on_loop() -> None:
-    """RuntimeError on the thread that would have to carry the answer."""
+    """Raise RuntimeError on the loop's thread, which would wait for itself."""
     if _local_hub is not None and _local_hub.on_loop():
         raise RuntimeError(
-            "an object of another host is used in a callback on Fiber's own thread, which would "
-            "wait for itself for ever: use it on a thread of the program"
+            "a callback on Fiber's event loop uses an object of another host: the loop would wait "
+            "for itself for ever. Use the object on a thread of the program"
         )
 
 
 def _after_fork() -> None:
-    """Reach the hub as another process, after a fork without Fiber: the copy does not have it."""
+    """Use the parent's hub from outside, after a fork that Fiber did not make."""
     global _local_hub, _address
     if _local_hub is not None:
         _address, _local_hub = _local_hub.known_address, None
@@ -151,7 +155,7 @@ os.register_at_fork(after_in_child=_after_fork)
 
 
 class Reply:
-    """Answer of a hub."""
+    """Reply of a hub."""
 
     __slots__ = ("fds", "number", "parts", "status", "values")
 
@@ -162,29 +166,29 @@ class Reply:
         self.fds, message.fds = message.fds, []
 
     def close_descriptors(self) -> None:
-        """Close the descriptors of the answer, which are not wanted."""
+        """Close the descriptors of a reply that is not used."""
         for fd in self.fds:
             os.close(fd)
 
 
 class HubStream:
-    """A stream to the hub that has ``home``'s objects.  Opening one waits for nothing."""
+    """Stream to the hub ``home``.  To open one does not wait."""
 
     def __init__(self, home: HubAddress, greeting: Iterable[bytes] = ()) -> None:
         self._host = home.host
         self._number = 0
         self._asked = 0
-        """The number of the last request that has an answer."""
+        """Number of the last request that gets a reply."""
         self._unsettled: Op | None = None
         self._begun: int | None = None
-        """The number of a request whose answer nobody has read."""
+        """Number of the request that ``begin`` sent and ``finish`` has not read."""
         self._end = "its hub is gone"
         self._sock, to_its_hub = _dial(home)
         try:
             for part in (*to_its_hub, protocol.hello(home.key), *greeting):
                 packet.send(self._sock, part)
         except BrokenPipeError:
-            pass  # the first request will find out why
+            pass  # the first request raises the reason
         except BaseException:
             self._sock.close()
             raise
@@ -198,7 +202,7 @@ class HubStream:
         buffers: Sequence[memoryview] = (),
         fds: Sequence[int] = (),
     ) -> Reply:
-        """Make a request and wait for its answer; NO once ``timeout`` seconds are over."""
+        """Send a request and wait for the reply; its status is NO after ``timeout`` seconds."""
         _refuse_on_loop()
         number = self._asked = self._next()
         self._unsettled = operation
@@ -208,35 +212,35 @@ class HubStream:
         except ObjectUnreachable:
             raise
         except BaseException:
-            # Ctrl-C, or what another signal's handler raised.
+            # Ctrl-C, or an error of another signal's handler.
             self.give_up(operation)
             raise
         self._unsettled = None
         return reply
 
     def begin(self, operation: Op, buffers: Sequence[memoryview]) -> None:
-        """Make a request and leave its answer for ``finish``."""
+        """Send a request.  ``finish`` reads the reply."""
         _refuse_on_loop()
         number = self._next()
         self._send(HEAD.pack(operation, number), buffers)
         self._begun = number
 
     def finish(self) -> Reply | None:
-        """The answer to what was begun; None if nothing was."""
-        number, self._begun = self._begun, None  # an answer that Ctrl-C interrupts is not repeated
+        """Return the reply to the request of ``begin``; None if there is no request."""
+        number, self._begun = self._begun, None  # after Ctrl-C the reply is not read again
         return None if number is None else self._reply(number, None)
 
     def give_up(self, operation: Op) -> None:
-        """Give up the answer to the last request, which was this operation.
+        """Give up the reply to the last request, ``operation``.
 
-        What it waits for should not be taken for us; what was, ``settle`` finds, and the hub takes
-        back a token.
+        The hub takes back a token that it gave this stream.  ``settle`` finds a reply that was sent
+        all the same.
         """
         self._unsettled = operation
         self._send(ONE.pack(Op.SYNC, self._next(), self._asked))
 
     def settle(self) -> tuple[Op, Reply] | None:
-        """The answer to a request that was given up, if it was answered all the same."""
+        """Return a request that was given up and its reply, if the hub replied all the same."""
         operation = self._unsettled
         if operation is None:
             return None
@@ -250,11 +254,11 @@ class HubStream:
         return (operation, late) if late is not None else None
 
     def say(self, operation: Op, *values: int | bytes, form: struct.Struct = HEAD) -> None:
-        """Make a request that has no answer."""
+        """Send a request that has no reply."""
         self._send(form.pack(operation, self._next(), *values))
 
     def receive(self) -> Reply:
-        """Receive the next message; ObjectUnreachable with the hub's reason at the end."""
+        """Receive the next reply; ObjectUnreachable with the hub's reason at the end."""
         try:
             message = packet.receive(self._sock, descriptors=True)
         except (EOFError, ConnectionError) as error:
@@ -270,15 +274,15 @@ class HubStream:
 
     @property
     def has_answered(self) -> bool:
-        """True if the last request was answered."""
+        """True if the hub replied to the last request."""
         return self._asked > 0 and self._unsettled is None
 
     def fileno(self) -> int:
-        """The stream's descriptor."""
+        """Return the stream's descriptor."""
         return self._sock.fileno()
 
     def close(self) -> None:
-        """End it."""
+        """Close the stream."""
         self._sock.close()
 
     def _next(self) -> int:
@@ -290,7 +294,7 @@ class HubStream:
         while True:
             if deadline is not None and not self._comes_by(deadline):
                 self._send(HEAD.pack(Op.CANCEL, number))
-                deadline = None  # now there will be an answer, whichever
+                deadline = None  # from here on there is a reply for sure
             reply = self.receive()
             if reply.number == number:
                 return reply
@@ -305,12 +309,12 @@ class HubStream:
         try:
             packet.send(self._sock, payload, buffers, fds)
         except BrokenPipeError:
-            while True:  # what the hub said before it closed says why, in the end
+            while True:  # the last reply before the end has the reason
                 self.receive()
 
 
 def _dial(home: HubAddress) -> tuple[socket.socket, Sequence[bytes]]:
-    """A socket towards ``home``, and what to say before greeting it."""
+    """Return a socket towards ``home``, and the messages before its greeting."""
     if home.host == host():
         return _connect(home), []
     hub = local_hub()
@@ -327,6 +331,6 @@ def _connect(to: HubAddress) -> socket.socket:
         sock.connect(to.path)
     except OSError as error:
         sock.close()
-        reason = f"nobody serves {to.path}, so its program has ended"
+        reason = f"no process listens at {to.path}, so its program has ended"
         raise ObjectUnreachable(to.host, reason) from error
     return sock

@@ -1,4 +1,4 @@
-"""A hub's side of one client's stream: who it is, what it is attached to, what it waits for."""
+"""Hub's side of one stream: its client, the object it is attached to, the request that waits."""
 
 from __future__ import annotations
 
@@ -38,7 +38,10 @@ _NAME_BYTES = 80
 
 
 class HandlerHub(Protocol):
-    """Part of the hub that a handler needs."""
+    """Part of the hub that a handler uses.
+
+    ``Hub`` implements it.  This module stands below ``Hub`` and cannot import it.
+    """
 
     key: bytes
     registry: Registry
@@ -46,18 +49,18 @@ class HandlerHub(Protocol):
     replicas: Replicas
 
     def connect(self, host: str, stream: Stream) -> None:
-        """Go on with ``stream`` at the hub of ``host``."""
+        """Connect ``stream`` to the hub of ``host``."""
 
     def ended(self, handler: ClientHandler) -> None:
-        """The client is gone."""
+        """Note that a handler has ended."""
 
 
 class RequestRefused(Exception):
-    """The stream has to end; says why."""
+    """Error: a request is refused and the stream ends.  The text says why."""
 
 
 class PendingRequest:
-    """Request that is answered once."""
+    """Request that waits for its reply, which is sent once."""
 
     __slots__ = ("_granted", "_handler", "_number")
 
@@ -83,7 +86,7 @@ class PendingRequest:
 
 
 class ClientHandler:
-    """Serves one stream; its ``Handler``."""
+    """Server of one stream; its ``StreamHandler``."""
 
     def __init__(self, home: HandlerHub, stream: Stream) -> None:
         self.stream = stream
@@ -94,16 +97,16 @@ class ClientHandler:
         self._joined: BlockIdentity | None = None
         self._bound: set[bytes] = set()
         self._holder: str | None = None
-        """Whose token the stream keeps."""
+        """Name of the process whose token the stream keeps."""
         self._granted_last: int | None = None
-        """The number of the request that got a token last, if anybody may still give it up."""
+        """Number of the last request that got a token, while the client may still give it up."""
         self._place: int | None = None
         self._claimed = False
-        """True if the counter was lowered for a client that has not confirmed it."""
+        """True if the counter was lowered for this client, which has not confirmed that."""
         stream.handler = self
 
     def on_message(self, message: Message) -> None:
-        """Do what it says."""
+        """Carry out a request."""
         try:
             operation = Op(message.payload[0])
             if not self._admitted:
@@ -117,21 +120,21 @@ class ClientHandler:
         except NoSuchObject as error:
             self._end(str(error))
         except (struct.error, ValueError, IndexError, KeyError, OSError) as error:
-            # A request that ours never send, or a system that has no descriptor left.
-            self._end(f"the hub could not do what was asked: {error}")
+            # A malformed request, or a system without a free descriptor.
+            self._end(f"the hub could not carry out the request: {error}")
 
     def on_room(self) -> None:
-        """Replies fit again; there is at most one at a time."""
+        """Do nothing: there is at most one reply at a time."""
 
     def on_closed(self, reason: str) -> None:
-        """Note that the user of the stream has ended."""
+        """Note that the client has ended."""
         if self._holder is not None:
             self._semaphore().abandon(self._holder)
             self._holder = None
         self._leave()
 
     def close(self, reason: str) -> None:
-        """End it from this side."""
+        """End the stream from this side."""
         self._end(reason)
 
     def _end(self, reason: str) -> None:
@@ -158,7 +161,7 @@ class ClientHandler:
         self._home.ended(self)
 
     def _cancel(self) -> PendingRequest | None:
-        """Withdraw the request that waits."""
+        """Withdraw and return the request that waits."""
         request, self.waiting = self.waiting, None
         if request is not None and self._hosted is not None:
             self._hosted.withdraw(request)
@@ -167,16 +170,19 @@ class ClientHandler:
     def _request(
         self, message: Message, granted: Callable[[], None] | None = None
     ) -> PendingRequest:
-        """A request to be answered later; ends the one before.  ``granted`` is called before OK."""
+        """Return a request to answer later, and withdraw the one before.
+
+        ``granted`` is called before a reply with the status OK.
+        """
         self._cancel()
         self.waiting = PendingRequest(self, HEAD.unpack_from(message.payload)[1], granted)
         return self.waiting
 
-    # Getting in
+    # Greeting
 
     def _admit(self, operation: Op, payload: memoryview) -> None:
         if operation is not Op.HELLO:
-            raise RequestRefused("a stream to a hub begins with a greeting")
+            raise RequestRefused("a stream to a hub has to begin with a greeting")
         _, _, version, key = protocol.HELLO.unpack(payload)
         if version != protocol.VERSION:
             raise RequestRefused(
@@ -188,11 +194,11 @@ class ClientHandler:
         self._admitted = True
 
     def hello(self, message: Message) -> None:
-        """Again, after CONNECT to this very host."""
+        """Check a second greeting, which comes after CONNECT to this host."""
         self._admit(Op.HELLO, message.payload)
 
     def connect(self, message: Message) -> None:
-        """Go on at another host's hub."""
+        """Connect the stream to another host's hub."""
         host = protocol.text(message.payload)
         self.stream.handler = NullHandler()
         self._leave()
@@ -201,7 +207,7 @@ class ClientHandler:
     # Objects
 
     def register(self, message: Message) -> None:
-        """Host a descriptor."""
+        """Register the object of a descriptor, and reply with a grant."""
         _, number, kind, flags, *extent = FOUR.unpack(message.payload)
         fd, *beside = message.fds
         granted = self._home.registry.register(
@@ -214,7 +220,7 @@ class ClientHandler:
         self._granted(number, flags, *granted)
 
     def grant(self, message: Message) -> None:
-        """Give a grant for an object that the sender uses."""
+        """Make a grant for an object that the client uses."""
         _, number, flags, token = GRANTING.unpack(message.payload)
         granted = self._home.registry.grant(token, reusable=bool(flags & GrantFlags.REUSABLE))
         self._granted(number, flags, *granted)
@@ -225,21 +231,21 @@ class ClientHandler:
         self.stream.send(SECRETS.pack(Status.OK, number, grant, identity))
 
     def release(self, message: Message) -> None:
-        """Take a grant back."""
+        """End a grant."""
         self._home.registry.take_back([SECRET.unpack(message.payload)[2]])
 
     def fetch(self, message: Message) -> None:
-        """Hand over an object's descriptors."""
+        """Reply with an object's descriptors."""
         _, number, grant = SECRET.unpack(message.payload)
         if not self.stream.passes_descriptors:
-            raise RequestRefused("a descriptor cannot be handed to another host")
+            raise RequestRefused("a descriptor cannot go to another host")
         fds = self._home.registry.fetch(grant)
         self.stream.send(HEAD.pack(Status.OK, number), (), fds)
 
     def attach(self, message: Message) -> None:
-        """Begin to use an object."""
+        """Attach the stream to an object."""
         if self._attachment is not None:
-            raise RequestRefused("a stream is for one object")
+            raise RequestRefused("a stream can have one object only")
         _, _, token, grant = SECRETS.unpack(message.payload)
         self._attachment = self._home.registry.attach(token, grant)
 
@@ -249,22 +255,22 @@ class ClientHandler:
         return None if self._attachment is None else self._attachment.shared.hosted
 
     def ring(self, message: Message) -> None:
-        """Look again at shared memory that somebody here waits for."""
+        """Ring the doorbell: requests that wait for shared memory look at it again."""
         self._home.doorbell.rung()
 
     def replicate(self, message: Message) -> None:
-        """Hand over memory that is in step with another host's, as long as this stream lasts."""
+        """Reply with a replica of another host's memory.  The stream keeps it."""
         number = HEAD.unpack_from(message.payload)[1]
         if not self.stream.passes_descriptors:
-            raise RequestRefused("a descriptor cannot be handed to another host")
+            raise RequestRefused("a descriptor cannot go to another host")
         if self._joined is not None:
-            raise RequestRefused("a stream is for one object")
+            raise RequestRefused("a stream can have one object only")
         origin = Origin.decode(message.buffers[0])
         self._joined = origin.block
         self._home.replicas.join(origin, self, _Joining(self, number))
 
     def cancel(self, message: Message) -> None:
-        """End the request that waits, with the answer NO."""
+        """Reply NO to the request that waits."""
         number = HEAD.unpack_from(message.payload)[1]
         if self.waiting is not None and self.waiting.number == number:
             request = self._cancel()
@@ -272,9 +278,9 @@ class ClientHandler:
             request.answer(Status.NO)
 
     def sync(self, message: Message) -> None:
-        """Answer, so that the requester knows that nothing else is to come.
+        """Reply, so that the client knows that no earlier reply follows.
 
-        A token that it was given meanwhile it does not know of.
+        Take back a token that the client got meanwhile, as it does not know of that.
         """
         if self._holder is not None:
             self._give_back()
@@ -321,11 +327,11 @@ class ClientHandler:
         self._channel().poll(self._request(message))
 
     def watch(self, message: Message) -> None:
-        """Say once when there is a message."""
+        """Send READY once when there is a message."""
         self._channel().watch(self.ready)
 
     def check(self, message: Message) -> None:
-        """Say whether there is a message now, and once more on the stream itself when there is."""
+        """Reply whether there is a message now; send READY once there is one."""
         channel, number = self._channel(), HEAD.unpack_from(message.payload)[1]
         channel.forget(self.ready)
         if channel.readable():
@@ -336,7 +342,7 @@ class ClientHandler:
             channel.watch(self.ready)
 
     def ready(self) -> None:
-        """The channel that this stream watches is readable."""
+        """Send READY: the channel that this stream watches is readable."""
         self.stream.send(HEAD.pack(Status.READY, 0))
 
     # A counter
@@ -354,27 +360,27 @@ class ClientHandler:
         return hosted
 
     def add(self, message: Message) -> None:
-        """Raise it."""
+        """Raise the counter."""
         counter, n = self._counter(), ONE.unpack(message.payload)[2]
         try:
             counter.add(n)
         except BlockingIOError:
-            raise RequestRefused("the count is as high as it can be") from None
+            raise RequestRefused("the counter is at its maximum") from None
         self._request(message).answer(Status.OK)
 
     def take(self, message: Message) -> None:
-        """Lower it."""
+        """Lower the counter."""
         self._counter().take(self._request(message))
 
     def claim(self, message: Message) -> None:
-        """Lower it until the stream ends, unless that is to be kept."""
+        """Lower the counter.  Without KEEP it is raised again at the next request or the end."""
         self._counter().take(self._request(message, self._on_claim))
 
     def _on_claim(self) -> None:
         self._claimed = True
 
     def keep(self, message: Message) -> None:
-        """Let it stay lowered."""
+        """Keep the counter lowered."""
         self._claimed = False
 
     def _unclaim(self) -> None:
@@ -383,19 +389,19 @@ class ClientHandler:
             self._counter().add(1)
 
     def clear(self, message: Message) -> None:
-        """Zero it."""
+        """Set the counter to zero."""
         self._request(message).answer(Status.OK, self._counter().clear())
 
     def value(self, message: Message) -> None:
-        """Tell it."""
+        """Reply with the count."""
         self._request(message).answer(Status.OK, self._counter().value())
 
     def wait(self, message: Message) -> None:
-        """Wait until it is above zero."""
+        """Wait until the count is above zero."""
         self._counter().wait(self._request(message))
 
     def changed(self, message: Message) -> None:
-        """Wait until it is another."""
+        """Wait until the count changes."""
         self._counter().changed(self._request(message), ONE.unpack(message.payload)[2])
 
     # A semaphore
@@ -407,7 +413,7 @@ class ClientHandler:
         return hosted
 
     def acquire(self, message: Message) -> None:
-        """Take a token, which is the stream's."""
+        """Take a token, which the stream keeps."""
         holder = bytes(message.buffers[0][:_NAME_BYTES]).decode(errors="replace")
         request = self._request(message)
         self._semaphore().acquire(request, partial(self._granted_to, holder, request.number))
@@ -422,7 +428,7 @@ class ClientHandler:
             self._holder = None
 
     def post(self, message: Message) -> None:
-        """Give back the stream's, or another's."""
+        """Return the token of this stream or of another holder."""
         request = self._request(message)
         try:
             self._semaphore().release()
@@ -433,7 +439,7 @@ class ClientHandler:
             request.answer(Status.OK)
 
     def tokens(self, message: Message) -> None:
-        """Tell how many there are."""
+        """Reply with the number of tokens."""
         self._request(message).answer(Status.OK, self._semaphore().value())
 
     # A wait list
@@ -445,7 +451,7 @@ class ClientHandler:
         return hosted
 
     def enter(self, message: Message) -> None:
-        """Take a place, which is the stream's."""
+        """Take a place, which the stream keeps."""
         self._place = self._wait_list().places.enter(afar=True)
         self._request(message).answer(Status.OK)
 
@@ -455,54 +461,54 @@ class ClientHandler:
         return self._place
 
     def sleep(self, message: Message) -> None:
-        """Answer once it is notified."""
+        """Reply once the place is notified."""
         self._wait_list().sleep(self._request(message), self._own_place())
 
     def leave(self, message: Message) -> None:
-        """Give the place up."""
+        """Free the place."""
         place, self._place = self._place, None
         notified = place is not None and self._wait_list().places.leave(place)
         self._request(message).answer(Status.OK if notified else Status.NO)
 
     def notify(self, message: Message) -> None:
-        """Wake some."""
+        """Wake some waiters."""
         self._wait_list().places.notify(ONE.unpack(message.payload)[2])
         self._request(message).answer(Status.OK)
 
     def waiters(self, message: Message) -> None:
-        """Tell how many wait."""
+        """Reply with the number of waiters."""
         self._request(message).answer(Status.OK, self._wait_list().places.waiters())
 
     def bury(self, message: Message) -> None:
-        """Tell how many died waiting."""
+        """Reply with the number of waiters that died."""
         self._request(message).answer(Status.OK, self._wait_list().places.bury())
 
     def hold(self, message: Message) -> None:
-        """Note how many things the stream's place has."""
+        """Note how many things the process of this stream has."""
         self._wait_list().places.hold(self._own_place(), ONE.unpack(message.payload)[2])
 
     def tally(self, message: Message) -> None:
-        """Note how many things the stream's place has, and set the second word."""
+        """Note how many things the process of this stream has, and set the second word."""
         _, _, held, total = TWO.unpack(message.payload)
         self._wait_list().places.tally(self._own_place(), held, total)
         self._request(message).answer(Status.OK)
 
     def held(self, message: Message) -> None:
-        """Tell how many things all places have."""
+        """Reply with the number of things that the processes of all places have."""
         self._request(message).answer(Status.OK, self._wait_list().places.held())
 
     def reclaim(self, message: Message) -> None:
-        """Give a counter back what the dead had."""
+        """Add the things of dead processes to a counter."""
         number = self._wait_list().places.reclaim(self._counter_named_in(message))
         self._request(message).answer(Status.OK, number)
 
     def get(self, message: Message) -> None:
-        """Tell a word."""
+        """Reply with one of the user's words."""
         value = self._wait_list().places.get(ONE.unpack(message.payload)[2] & 1)
         self._request(message).answer(Status.OK, value & _WORD)
 
     def set(self, message: Message) -> None:
-        """Set a word."""
+        """Set one of the user's words."""
         _, _, number, value = TWO.unpack(message.payload)
         self._wait_list().places.set(number & 1, value - (1 << 64) if value >> 63 else value)
         self._request(message).answer(Status.OK)
@@ -512,19 +518,19 @@ _WORD = (1 << 64) - 1
 
 
 class _Joining:
-    """A client's request for memory of another host; a ``Joiner``."""
+    """Client's request for memory of another host; a ``Joiner``."""
 
     def __init__(self, handler: ClientHandler, number: int) -> None:
         self._handler = handler
         self._number = number
 
     def joined(self, block: Block) -> None:
-        """Hand it over."""
+        """Reply with the block."""
         reply = ONE.pack(Status.OK, self._number, block.offset)
         self._handler.stream.send(reply, (), [os.dup(block.segment.fileno())])
 
     def refused(self, reason: str) -> None:
-        """Close the stream, as there is nothing to hand over."""
+        """Close the stream, as there is no block to send."""
         self._handler.close(reason)
 
 

@@ -1,6 +1,7 @@
-"""The directory of a hub: its socket, and notes of named shared memory, which outlives processes.
+"""Directory of a hub: its socket, and notes of named shared memory, which outlives processes.
 
-Whoever outlives the program removes it, the zygote too, so this imports little.
+The last process of the program removes the directory.  That may be the zygote, so this module
+imports little.
 """
 
 from __future__ import annotations
@@ -14,19 +15,19 @@ _NOTE = "memory-"
 
 
 def note_memory(directory: str, name: str) -> None:
-    """Remove the shared memory ``name`` together with the directory."""
+    """Note that ``name`` is removed together with the directory."""
     with open(os.path.join(directory, _NOTE + name), "xb"):
         pass
 
 
 def forget_memory(directory: str, name: str) -> None:
-    """Forget a name that was removed."""
+    """Remove the note of a name that was removed."""
     with contextlib.suppress(FileNotFoundError):
         os.unlink(os.path.join(directory, _NOTE + name))
 
 
 def remove_directory(path: str) -> None:
-    """Remove a hub's directory, also after its process was killed; nothing if it is gone."""
+    """Remove a hub's directory and its named shared memory, if they are still there."""
     with contextlib.suppress(OSError):
         for entry in os.listdir(path):
             if entry.startswith(_NOTE):

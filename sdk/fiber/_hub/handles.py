@@ -1,13 +1,13 @@
-"""Handles: how a channel or counter gets into another process.
+"""Handles: the pickled form of channels, counters and blocks.
 
-* To a process that is being started on the same host, descriptors go along with the start message.
-* Otherwise the hub of this host keeps a descriptor, and the pickle holds how to ask for it.  Who
-  unpickles it on the same host is handed a descriptor, on another host it gets an object of which
-  every operation is a request.
+* For a process that is being started on the same host, descriptors go along with the start message.
+* Otherwise the hub of this host keeps a descriptor, and the handle says how to ask for it.  A
+  process of the same host that unpickles the handle gets a descriptor.  A process of another host
+  gets an object whose operations are requests.
 
-The hub keeps the object as long as a grant for it is out, which the handle carries.  A handle works
-once, for whoever unpickles it first; one whose grant is in a ``GrantSet`` works until the set is
-released.
+A handle carries a grant.  The hub keeps the object while there is a grant for it.  A handle works
+once, for the first process that unpickles it.  If its grant is in a ``GrantSet``, the handle works
+until the set is released.
 """
 
 from __future__ import annotations
@@ -52,19 +52,22 @@ from fiber._wire.descriptor import Descriptor, opened, own
 
 
 class DescriptorHandle(Protocol):
-    """Stands for a descriptor that goes along with a start message."""
+    """Handle of a descriptor that goes along with a start message.
+
+    multiprocessing's ``DupFd`` and Fiber's ``InheritedDescriptor`` implement it.
+    """
 
     def detach(self) -> int:
         """Return the descriptor, in the started process."""
 
 
 class HubHandle(NamedTuple):
-    """Stands for an object that a hub keeps."""
+    """Handle of an object that a hub keeps."""
 
     home: HubAddress
     grant: bytes
     identity: bytes
-    """Identity of shared memory: the same in all handles of it."""
+    """Identity of shared memory, the same in all its handles."""
 
     def __repr__(self) -> str:
         return f"HubHandle(home={self.home!r})"
@@ -93,9 +96,9 @@ Handle: TypeAlias = DescriptorHandle | HubHandle
 
 
 class BlockHandle(NamedTuple):
-    """Stands for a block of shared memory.
+    """Handle of a block of shared memory.
 
-    What it becomes on another host is the business of whoever pickled it.
+    The class that pickled it decides what it becomes on another host.
     """
 
     segment: Handle
@@ -114,12 +117,12 @@ class BlockHandle(NamedTuple):
 
 
 class EndHandle(NamedTuple):
-    """Stands for an end of a one-way channel: a socket, and a block for its backlog."""
+    """Handle of an end of a one-way channel: a socket, and a block for its backlog."""
 
     kind: ObjectKind
     socket: Handle
     segment: Handle | None
-    """None where the hub that keeps the socket keeps the segment beside it."""
+    """Segment of the block; None if the hub keeps it together with the socket."""
     extent: Extent
 
     def end(self) -> SharedChannel:
@@ -195,9 +198,11 @@ def _inherited_segment(spawning: Any, block: Block) -> DescriptorHandle:
     if inherit is not None:
         segment: DescriptorHandle = inherit(block.segment)
         return segment
-    # multiprocessing's own Process takes each descriptor once, and closes it in the child.
+    # multiprocessing's Process takes each descriptor once, and closes it in the child.
     duplicate = opened(os.dup, block.segment.fileno())
-    vars(spawning).setdefault("_fiber_duplicates", []).append(duplicate)  # until it started
+    vars(spawning).setdefault("_fiber_duplicates", []).append(
+        duplicate
+    )  # kept until the process has started
     return _inherited(spawning, duplicate.fileno())
 
 
@@ -218,16 +223,16 @@ def handle_for_remote_block(end: RemoteObject, extent: Extent) -> BlockHandle:
 
 
 def _spawning_here() -> Any:
-    """The start of a process of this host that is in progress on this thread."""
+    """Return the start of a process of this host that is in progress on this thread, or None."""
     spawning: Any = mp_context.get_spawning_popen()
     return None if getattr(spawning, "other_host", False) else spawning
 
 
 class GrantSet:
-    """Grants that last until they are released, the set is forgotten or this process ends.
+    """Grants that last until the set is released or forgotten, or this process ends.
 
-    ``reusable``: for what may be unpickled any number of times, as a task that may run again.
-    Otherwise each also ends with its first use, as what is given to a new process.
+    ``reusable`` grants are for handles that may be unpickled several times, as those of a task that
+    may run again.  Other grants also end with their first use, as those for a new process.
     """
 
     __slots__ = ("_direct", "_kept", "_reusable", "_streams")
@@ -239,17 +244,17 @@ class GrantSet:
         self._kept: list[object] = []
 
     def __bool__(self) -> bool:
-        """True if there is anything to release."""
+        """Tell whether the set has grants or objects to release."""
         return bool(self._direct or self._streams or self._kept)
 
     def keep(self, thing: object) -> None:
-        """Keep something alive that whoever unpickles the handles relies on."""
+        """Keep an object alive that the unpickled handles need."""
         self._kept.append(thing)
 
     def for_local(
         self, kind: ObjectKind, fd: int, extent: Extent = WHOLE, *, beside: Sequence[int] = ()
     ) -> HubHandle:
-        """A handle for an object of this host."""
+        """Return a handle for an object of this host."""
         home = client.hub_address()
         hub = client.local_hub()
         if hub is not None:
@@ -262,20 +267,20 @@ class GrantSet:
         return _register(self._stream(home), home, kind, fds, extent, self._flags())
 
     def for_remote(self, end: RemoteObject) -> HubHandle:
-        """A handle for an object of another host."""
-        end.confirm()  # its hub must know that it is used before another stream says so
+        """Return a handle for an object of another host."""
+        end.confirm()  # its hub must know the token before another stream uses it
         reply = self._stream(end.home).ask(Op.GRANT, self._flags(), end.token, form=GRANTING)
         return HubHandle(end.home, *reply.values)
 
     def release(self) -> None:
-        """End the grants: the handles are not unpickled from now on."""
+        """End the grants: no process unpickles the handles from now on."""
         direct, self._direct = self._direct, {}
         streams, self._streams = self._streams, {}
         self._kept.clear()
         for registry, grants in direct.items():
             registry.release(grants)
         for stream in streams.values():
-            stream.close()  # a hub takes back what was granted on a stream when it ends
+            stream.close()  # at the end of a stream its hub ends the stream's grants
 
     def __del__(self) -> None:
         if hasattr(self, "_streams"):  # else ``__init__`` was interrupted
@@ -292,21 +297,21 @@ class GrantSet:
 
 
 class _SingleUse:
-    """Grants for whoever unpickles a handle first; they outlive this process."""
+    """Grants for the first process that unpickles a handle.  They outlive this process."""
 
     def __init__(self) -> None:
         self.reset()
         os.register_at_fork(after_in_child=self.reset)
 
     def reset(self) -> None:
-        """Open new streams from here on."""
-        # Each is for whoever takes it out, which a finalizer in the middle of that may be, too.
+        """Forget the streams, so that new ones are opened."""
+        # A thread owns the stream that it has taken out.  A finalizer may take one in between.
         self._streams: deque[tuple[HubAddress, HubStream]] = deque()
 
     def for_local(
         self, kind: ObjectKind, fd: int, extent: Extent = WHOLE, *, beside: Sequence[int] = ()
     ) -> HubHandle:
-        """A handle for an object of this host."""
+        """Return a handle for an object of this host."""
         home = client.hub_address()
         hub = client.local_hub()
         if hub is None:
@@ -320,7 +325,7 @@ class _SingleUse:
         return HubHandle(home, *granted)
 
     def for_remote(self, end: RemoteObject) -> HubHandle:
-        """A handle for an object of another host."""
+        """Return a handle for an object of another host."""
         with end.stream() as stream:
             reply = stream.ask(Op.GRANT, GrantFlags(0), end.token, form=GRANTING)
         handle = HubHandle(end.home, *reply.values)
@@ -329,7 +334,7 @@ class _SingleUse:
 
     @contextlib.contextmanager
     def stream(self, home: HubAddress) -> Iterator[HubStream]:
-        """A stream to that hub, for one request."""
+        """Yield a stream to the hub ``home``, for one request."""
         try:
             to, stream = self._streams.pop()
         except IndexError:
@@ -340,7 +345,7 @@ class _SingleUse:
         try:
             yield stream
         except BaseException:
-            # Whatever it was, Ctrl-C or the hub's refusal, the next one begins anew.
+            # After Ctrl-C or a refusal of the hub, the next request needs a new stream.
             stream.close()
             raise
         self._streams.append((home, stream))
@@ -368,9 +373,10 @@ def _release_remote(end: RemoteObject, grant: bytes) -> None:
 
 
 class Pickling:
-    """Pickling of an object: it gives grants to handles, and takes back those for one use.
+    """Pickling of an object: it gives grants to handles, and ends them if it fails.
 
-    It counts until it is ``done`` or forgotten, so whoever is interrupted at any line leaves none.
+    It is the thread's current pickling until it is ``done`` or forgotten.  So an interrupted
+    pickling leaves no trace.
     """
 
     __slots__ = ("__weakref__", "done", "grants", "reusable", "undo")
@@ -393,9 +399,9 @@ class Pickling:
 
 
 def ring() -> None:
-    """Have this host's hub look at shared memory for which it waits on behalf of another host.
+    """Ring the doorbell of this host's hub, so that it looks at shared memory again.
 
-    Waits for nothing.  A hub that cannot be told, or is killed meanwhile, looks of its own accord.
+    Never waits.  If the hub cannot be reached, it looks again by itself some time later.
     """
     with contextlib.suppress(OSError, ObjectUnreachable):
         hub = client.local_hub()
@@ -418,13 +424,14 @@ _single_use = _SingleUse()
 
 
 def begin_pickling(*, reusable: bool = False) -> Pickling:
-    """Handles pickled on this thread work once, or until the result's ``grants`` are released.
+    """Begin a pickling on this thread, and return it.
 
-    Until the result is ``done``; this may be a signal's handler that runs in the middle of another
-    pickling, which goes on then.
+    Until it is ``done``, handles that are pickled on this thread work once, or, if ``reusable``,
+    until its ``grants`` are released.  A signal's handler may begin one in the middle of another,
+    which then goes on.
     """
     pickling = Pickling(reusable)
-    _current()  # forgets those that are done, which nobody else may ever do
+    _current()  # forgets picklings that are done, as no other call may ever do that
     _this_thread.picklings.append(weakref.ref(pickling))
     return pickling
 
@@ -440,14 +447,14 @@ def _current() -> Pickling | None:
 
 
 def undo_pickling() -> None:
-    """Take back the present pickling, which begins anew in another way."""
+    """End the grants of the current pickling, which begins again in another way."""
     pickling = _current()
     if pickling is not None:
         pickling.take_back()
 
 
 def _undo_by(step: Callable[[], None]) -> None:
-    """Remember how a grant is taken back, if anybody is to ask."""
+    """Note how to end a grant if the current pickling fails."""
     pickling = _current()
     if pickling is not None:
         pickling.undo.append(step)
@@ -464,8 +471,10 @@ def _grants() -> GrantSet | _SingleUse:
 
 
 def keep_until_released(thing: object) -> None:
-    """Keep something alive while what is being pickled may be unpickled, where that is known: a
-    new process has its arguments until it ends, a task until it is done.
+    """Keep an object alive while the handles of the current pickling may be unpickled.
+
+    That time is known for the arguments of a new process, until it ends, and for a task, until it
+    is done.
     """
     grants = _grants()
     if isinstance(grants, GrantSet):
@@ -474,9 +483,10 @@ def keep_until_released(thing: object) -> None:
 
 @contextlib.contextmanager
 def collecting_grants(*, reusable: bool = True) -> Iterator[GrantSet]:
-    """Handles pickled on this thread within the block work until the yielded set is released.
+    """Yield a set for the grants of handles that this thread pickles within the block.
 
-    If the block raises, it is released.  Not ``reusable``: each works once.
+    The handles work until the set is released.  If the block raises, it is released.  Without
+    ``reusable`` each handle works once.
     """
     pickling = begin_pickling(reusable=reusable)
     pickling.grants = grants = GrantSet(reusable=reusable)

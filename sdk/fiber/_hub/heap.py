@@ -1,11 +1,12 @@
-"""Memory that processes of one host share: *segments*, and the *blocks* that are pieces of them.
+"""Heap: memory that processes of one host share, in *segments*, and *blocks* as pieces of them.
 
-A segment is a memfd.  It has no name: whoever uses a block of it holds a descriptor, and the kernel
-frees it once nobody does, whoever is killed.  A process maps it once, however many of its blocks it
-uses.  A large block has a segment to itself, small ones of a size share segments.
+A segment is a memfd without a name.  Each process that uses a block of it holds a descriptor, and
+the kernel frees the segment after the last descriptor, also when processes are killed.  A process
+maps a segment once, for all its blocks.  A large block has a segment to itself; small blocks of one
+size share segments.
 
-No lock: a finalizer, a signal's handler or any thread may come at any line.  What they share are
-operations that the interpreter does whole, and a block is for whoever has taken its place out.
+There is no lock: a finalizer, a signal's handler or any thread may interrupt at any step.  Shared
+state changes by single steps of the interpreter, and a thread owns the piece that it has taken out.
 """
 
 from __future__ import annotations
@@ -24,23 +25,23 @@ from fiber._transport.channels import naming_the_limit
 from fiber._wire.descriptor import Descriptor, opened
 
 SEGMENT = 1 << 20
-"""Bytes of a segment that small blocks share; such as nobody wrote to take no memory."""
+"""Bytes of a segment that small blocks share.  Pages that are never written take no memory."""
 
 LARGE = 1 << 16
-"""Bytes from which on a block has a segment to itself."""
+"""Bytes from which a block has a segment to itself."""
 
 ALIGNMENT = 64
-"""Alignment of blocks, in bytes: each begins in its own line of the processor's cache."""
+"""Alignment of blocks, in bytes: blocks share no cache line."""
 
 SIZES = tuple(ALIGNMENT << doubled for doubled in range(LARGE.bit_length() - 6))
-"""Sizes of small blocks, in bytes.  A block of another size gets a place of the next larger one."""
+"""Sizes of small blocks, in bytes.  Another size is rounded up to the next of them."""
 
-# A mapping needs no descriptor of its own beside ours; before Python 3.13 it has one.
+# From Python 3.13 a mapping does not need to duplicate the descriptor.
 _UNTRACKED: dict[str, Any] = {"trackfd": False} if sys.version_info >= (3, 13) else {}
 
 
 class Segment:
-    """A memfd, mapped."""
+    """Memfd that this process has mapped."""
 
     __slots__ = ("__weakref__", "_map", "_owner", "address", "inode", "size")
 
@@ -48,7 +49,7 @@ class Segment:
         self._owner = owner
         status = os.fstat(owner.fileno())
         self.inode = status.st_ino
-        """Number that no other segment of this host has, while this one exists."""
+        """Number of the segment, unique on this host while the segment exists."""
         self.size = status.st_size
         self._map = mmap.mmap(owner.fileno(), self.size, **_UNTRACKED)
         self.address = ctypes.addressof(ctypes.c_char.from_buffer(self._map))
@@ -58,15 +59,15 @@ class Segment:
         return self._owner.fileno()
 
     def view(self, offset: int, size: int) -> memoryview:
-        """Part of its memory."""
+        """Return a view of a part of the memory."""
         return memoryview(self._map)[offset : offset + size]
 
 
 class Block:
-    """A piece of shared memory; zeroed when it was allocated.
+    """Piece of shared memory, zero when it is allocated.
 
-    Its memory stays as long as this object, or one that was pickled as it, is somewhere.  A block
-    that never left this process is used again once it is forgotten: keep it while you use ``view``.
+    Its memory stays as long as this object, or an unpickled copy in any process, exists.  A block
+    that never left this process is reused after this object: keep it while you use ``view``.
     """
 
     __slots__ = ("__weakref__", "_allocation", "offset", "segment", "size")
@@ -95,13 +96,13 @@ class Block:
         return self.segment.inode, self.offset
 
     def give(self) -> None:
-        """Another process may use it from here on."""
+        """Note that another process may use the block from here on, so it is not reused."""
         if self._allocation is not None:
             self._allocation.given = True
 
 
 class _Allocation:
-    """Place of a small block.  It is reused after the block, unless other processes have it."""
+    """Piece of a segment for a small block.  It is reused, unless other processes have it."""
 
     __slots__ = ("_forks", "_home", "_offset", "_segment", "given")
 
@@ -113,13 +114,13 @@ class _Allocation:
         self._home = home
 
     def __del__(self) -> None:
-        # Without ``_home``, ``__init__`` was interrupted.
+        # ``_home`` is missing if ``__init__`` was interrupted.
         if hasattr(self, "_home") and not self.given and self._forks == _forks:
             self._home.free.append((self._segment, self._offset))
 
 
 class _SizeClass:
-    """Small blocks of one size."""
+    """Segments and free pieces for small blocks of one size."""
 
     def __init__(self, size: int) -> None:
         self.size = size
@@ -131,7 +132,7 @@ class _SizeClass:
         self._fresh: tuple[Segment, itertools.count[int]] | None = None
 
     def take(self) -> tuple[Segment, int]:
-        """A place for a block."""
+        """Return a zeroed piece for a block."""
         try:
             segment, offset = self.free.pop()
         except IndexError:
@@ -141,8 +142,8 @@ class _SizeClass:
 
     def _take_fresh(self) -> tuple[Segment, int]:
         while True:
-            # Of two threads that make a segment at the same time, one wins; what the other one has
-            # taken of its own stays good.
+            # Two threads may each make a segment.  One becomes the current one; the piece that was
+            # taken from the other stays valid.
             fresh = self._fresh
             if fresh is None:
                 segment = _new_segment("fiber-heap", SEGMENT)
@@ -154,7 +155,7 @@ class _SizeClass:
 
 
 def allocate(size: int) -> Block:
-    """A new block of ``size`` bytes, all zero, at a multiple of ``ALIGNMENT``."""
+    """Return a new block of ``size`` bytes, all zero, at a multiple of ``ALIGNMENT``."""
     if size >= LARGE:
         return Block(_new_segment("fiber-block", size), 0, size)
     home = _size_classes[bisect.bisect_left(SIZES, size)]
@@ -163,7 +164,7 @@ def allocate(size: int) -> Block:
 
 
 def block_of(owner: Descriptor, offset: int, size: int) -> Block:
-    """A block of the segment of which ``owner`` holds a descriptor."""
+    """Return a block of the segment of a descriptor; ValueError if it lies outside."""
     block = Block(_mapped(owner), offset, size)
     if offset < 0 or size < 0 or offset + size > block.segment.size:
         raise ValueError(f"a segment of {block.segment.size} bytes has no {size} at {offset}")
@@ -181,7 +182,7 @@ def _mapped(owner: Descriptor) -> Segment:
     inode = os.fstat(owner.fileno()).st_ino
     segment = _segments.get(inode)
     if segment is None:
-        # Of two threads that come first at the same time each may map it: as good, but twice.
+        # Two threads may each map it at the same time: that works, and costs a second mapping.
         with naming_the_limit("sharing memory"):
             segment = _segments[inode] = Segment(owner)
     return segment
@@ -193,13 +194,13 @@ _forks = 0
 
 
 def _before_fork() -> None:
-    """The blocks that there are belong to two processes from here on."""
+    """Count the fork: existing blocks belong to two processes from here on."""
     global _forks
     _forks += 1
 
 
 def _after_fork() -> None:
-    """Our parent goes on with its segments; this process begins its own."""
+    """Begin new segments in a forked process, as the parent uses the present ones."""
     for blocks in _size_classes:
         blocks.reset()
 

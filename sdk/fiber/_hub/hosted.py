@@ -1,12 +1,12 @@
-"""Objects of this host as its hub sees them, with the requests that wait for them, on the loop
-thread.
+"""Objects that a hub serves to other hosts, and the requests that wait for them.
 
-A hub takes a message out of a channel, or lowers a counter, only for a request that waits for it,
-and answers at once.  A client that dies has taken only what it asked for.
+All classes run on the loop thread.  A hub takes a message out of a channel, or lowers a counter,
+only for a request that waits for it, and replies at once.  So a client that dies has taken no more
+than it requested.
 
-``HostedSemaphore`` has tokens for processes of other hosts.  The loop never waits: while a process
-of another host waits for a token, each release rings the hub's doorbell.  The first process that
-asked gets the token first. ``HostedWaitList`` is the wait list of a condition.
+``HostedSemaphore`` holds tokens for processes of other hosts.  The loop never waits: while such a
+process waits for a token, each release rings the hub's doorbell.  Requests get tokens in their
+order.  ``HostedWaitList`` is the wait list of a condition.
 """
 
 from __future__ import annotations
@@ -27,10 +27,13 @@ from fiber._wire.packet import INLINE_LIMIT, Message
 
 
 class Waiter(Protocol):
-    """A request that waits."""
+    """Request that waits.
+
+    ``PendingRequest`` implements it.  This module stands below ``client_handler``.
+    """
 
     def answer(self, status: Status, value: int = 0, buffers: Sequence[memoryview] = ()) -> None:
-        """Answer it; once."""
+        """Reply to the request, once."""
 
 
 class HostedChannel:
@@ -49,13 +52,13 @@ class HostedChannel:
         return self._channel.fileno()
 
     def send(self, waiter: Waiter, parts: Sequence[memoryview]) -> None:
-        """Send payload and buffers, in the order of asking."""
+        """Send payload and buffers, in the order of the requests."""
         self._senders.append((waiter, parts))
         self._serve_senders()
         self._watch()
 
     def receive(self, waiter: Waiter, *, wait: bool) -> None:
-        """Answer with the next message."""
+        """Reply with the next message."""
         self._receivers.append(waiter)
         self._serve_receivers()
         if not wait and waiter in self._receivers:
@@ -64,7 +67,7 @@ class HostedChannel:
         self._watch()
 
     def poll(self, waiter: Waiter) -> None:
-        """Answer when it is readable."""
+        """Reply once the channel is readable."""
         if self.readable():
             waiter.answer(Status.OK)
         else:
@@ -76,7 +79,7 @@ class HostedChannel:
         return self._channel.poll(0)
 
     def watch(self, watcher: Callable[[], None]) -> None:
-        """Say once when it is readable."""
+        """Call ``watcher`` once when the channel is readable."""
         if self.readable():
             watcher()
         else:
@@ -103,7 +106,7 @@ class HostedChannel:
         self._watch()
 
     def close(self) -> None:
-        """Let go of the end."""
+        """Stop serving the channel, and close it."""
         self._poller.forget(self._channel.fileno())
         self._channel.close()
 
@@ -152,7 +155,7 @@ class HostedChannel:
     def _hand_over(self, waiter: Waiter, message: Message) -> None:
         payload, buffers = message.payload, message.buffers
         if len(payload) <= INLINE_LIMIT:
-            # It may be borrowed, and the answer may have to wait.
+            # It may be in borrowed memory, and the reply may have to wait.
             payload = memoryview(message.tobytes())
         waiter.answer(Status.OK, self.readable(), [payload, *buffers])
 
@@ -166,10 +169,10 @@ class HostedChannel:
 
 
 class HostedReceiver(HostedChannel):
-    """The receiving end of a one-way channel.
+    """Receiving end of a one-way channel.
 
-    It looks at the backlog each second while somebody waits: a process of this host that dies with
-    the wake-up packet wakes nobody.
+    While a request waits, it looks at the backlog each second.  A process of this host that dies
+    with the wake-up packet does not wake other readers.
     """
 
     def __init__(self, loop: Loop, poller: Poller, channel: ReceivingEnd) -> None:
@@ -178,7 +181,7 @@ class HostedReceiver(HostedChannel):
         self._is_looking = False
 
     def close(self) -> None:
-        """Let go of the end."""
+        """Stop serving the channel, and close it."""
         self._receivers.clear()
         self._pollers.clear()
         self._watchers.clear()
@@ -197,7 +200,7 @@ class HostedReceiver(HostedChannel):
 
 
 class HostedCounter:
-    """A counter."""
+    """Counter that the hub serves."""
 
     def __init__(self, poller: Poller, counter: LocalCounter) -> None:
         self._poller = poller
@@ -215,25 +218,25 @@ class HostedCounter:
         self._counter.add(n)
 
     def clear(self) -> int:
-        """Zero it."""
+        """Set the count to zero and return the count before."""
         return self._counter.clear()
 
     def value(self) -> int:
-        """The count."""
+        """Return the count."""
         return self._counter.value()
 
     def take(self, waiter: Waiter) -> None:
-        """Answer when the count was lowered for it."""
+        """Reply once the count was lowered for this request."""
         self._takers.append(waiter)
         self._event(IN)
 
     def wait(self, waiter: Waiter) -> None:
-        """Answer when the count is above zero."""
+        """Reply once the count is above zero."""
         self._waiters.append(waiter)
         self._event(IN)
 
     def changed(self, waiter: Waiter, since: int) -> None:
-        """Answer when the count is not ``since``."""
+        """Reply once the count is not ``since``."""
         self._changes[waiter] = since
         self._event(IN)
 
@@ -248,14 +251,14 @@ class HostedCounter:
         return found
 
     def close(self) -> None:
-        """Let go of it."""
+        """Stop serving the counter, and close it."""
         self._poller.forget(self._counter.fileno())
         self._counter.close()
 
     def _watch(self) -> None:
         mask = IN if self._takers or self._waiters else 0
         if not mask and self._changes:
-            # A count that stays above zero would be reported for ever.
+            # Without EDGE, a count that stays above zero would be reported again and again.
             mask = IN | EDGE
         self._poller.watch(self._counter.fileno(), mask, self._event)
 
@@ -274,18 +277,18 @@ class HostedCounter:
 
 
 class HostedMemory:
-    """Shared memory, which is kept there: what changes does not travel on these streams."""
+    """Shared memory that the hub keeps.  Its changes do not travel on streams."""
 
     def withdraw(self, waiter: Waiter) -> bool:
-        """Return False: nothing waits for it."""
+        """Return False: no request waits for memory."""
         return False
 
     def close(self) -> None:
-        """The registry lets go of it."""
+        """Do nothing: the registry closes the descriptors."""
 
 
 _RELEASE_AGAIN = 0.005
-"""Seconds until the next try while dead processes' tokens are given back."""
+"""Seconds until the next attempt to return a token during a revival."""
 
 
 class HostedSemaphore:
@@ -294,14 +297,17 @@ class HostedSemaphore:
     def __init__(self, loop: Loop, doorbell: Doorbell, block: SharedBlock) -> None:
         self._loop = loop
         self._doorbell = doorbell
-        # A view of its own, and no recursive one: the tokens are not this process's.
+        # A separate view, not a recursive one, as this process does not use the tokens itself.
         self._semaphore = SharedSemaphore(block, COUNTING)
         self._waiters: deque[tuple[Waiter, Callable[[bool], None]]] = deque()
         self._is_listening = False
         self._revival = threading.Thread()  # none yet
 
     def acquire(self, waiter: Waiter, granted: Callable[[bool], None]) -> None:
-        """Answer once there is a token for it, having told ``granted`` whether it is to keep it."""
+        """Reply once there is a token for this request.
+
+        Before that, call ``granted`` with whether the stream keeps the token.
+        """
         self._waiters.append((waiter, granted))
         self._serve()
         if self._waiters and not self._is_listening:
@@ -311,21 +317,23 @@ class HostedSemaphore:
             self._look()
 
     def release(self) -> None:
-        """Give a token back; ValueError if there are as many as there can be."""
+        """Return a token; ValueError if the semaphore is at its maximum."""
         if self._semaphore.release(wait=False):
             self._serve()
         else:
             self._loop.call_later(_RELEASE_AGAIN, self.release)
 
     def abandon(self, holder: str) -> None:
-        """Give back a token of a process that has ended."""
+        """Return the token of a process that has ended, with a warning."""
         self._semaphore.abandon(holder)
-        with contextlib.suppress(RuntimeWarning):  # as an error it would end the hub
+        with contextlib.suppress(
+            RuntimeWarning
+        ):  # a filter may make it an error, which would end the hub
             warn_of(holder)
         self.release()
 
     def value(self) -> int:
-        """Return how often it can be acquired now."""
+        """Return the number of tokens that are available."""
         return self._semaphore._get_value()
 
     def withdraw(self, waiter: Waiter) -> bool:
@@ -337,7 +345,7 @@ class HostedSemaphore:
         return False
 
     def close(self) -> None:
-        """Stop serving it: no process of another host uses it."""
+        """Stop serving it, as no process of another host uses it."""
         self._waiters.clear()
         self._stop_listening()
 
@@ -350,7 +358,10 @@ class HostedSemaphore:
             waiter.answer(Status.OK, tracked, holder)
 
     def _look(self) -> None:
-        """Now and then: who would ring may die before it does, or while it has a token."""
+        """Look for tokens, also lost ones.
+
+        A process may die before it rings the doorbell, or while it holds a token.
+        """
         self._serve()
         if not self._waiters:
             self._stop_listening()
@@ -368,7 +379,10 @@ class HostedSemaphore:
 
 
 _LOOK = 1.0
-"""Seconds until it looks for itself whether somebody was notified: who rings may die before."""
+"""Seconds until the hub looks by itself for notified waiters.
+
+A process may die after it notified a waiter and before it rings the doorbell.
+"""
 
 
 class HostedWaitList:
@@ -382,7 +396,7 @@ class HostedWaitList:
         self._is_looking = False
 
     def sleep(self, waiter: Waiter, place: int) -> None:
-        """Answer once that place is notified."""
+        """Reply once ``place`` is notified."""
         if not self._sleepers:
             self._doorbell.listen(self._serve)
         self._sleepers[waiter] = place
@@ -396,7 +410,7 @@ class HostedWaitList:
         return self._sleepers.pop(waiter, None) is not None
 
     def close(self) -> None:
-        """Stop serving it: no process of another host uses it."""
+        """Stop serving it, as no process of another host uses it."""
         self._sleepers.clear()
         self._doorbell.forget(self._serve)
 

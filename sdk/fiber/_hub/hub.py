@@ -1,8 +1,9 @@
-"""The hub: keeps what processes of this host share with others, one per host and program.
+"""Hub: keeps the objects that processes of this host share with others.
 
-It lives in the agent of its host, on its loop.  A process of the same host asks it for descriptors
-and needs it no more; one on another host reaches it through a tunnel and uses its objects by
-request (``fiber._hub.remote``).  A client has to know the hub's key, and for each object a grant.
+There is one hub for each host and program.  It runs in the agent of its host, on the agent's loop.
+A process of the same host asks it once for an object's descriptors.  A process of another host
+reaches it through a tunnel and uses the object by requests (``fiber._hub.remote``).  A client needs
+the hub's key, and a grant for each object.
 """
 
 from __future__ import annotations
@@ -56,11 +57,11 @@ from fiber.errors import TooManyOpenFiles
 _PEER = struct.Struct("iII")  # pid, uid, gid
 
 _ACCEPT_AGAIN = 0.1
-"""Seconds until the next try when no descriptor is free to accept a stream with."""
+"""Seconds until the next attempt to accept a stream, if no descriptor is free."""
 
 
 class Hub:
-    """Hub of a host.  Runs on the loop's thread, but for methods marked "any thread"."""
+    """Hub of a host.  Runs on the loop's thread, except methods marked "any thread"."""
 
     def __init__(
         self, loop: Loop, host: str, parent: str | None = None, directory: str | None = None
@@ -78,7 +79,7 @@ class Hub:
         self._router = Router(host, self._accept)
         self._handlers: set[ClientHandler] = set()
         self._streams: weakref.WeakSet[SocketStream] = weakref.WeakSet()
-        # Of several that open it at the same time, the first here counts.
+        # If several threads open it at the same time, the first entry is valid.
         self._opened: list[tuple[HubAddress, socket.socket | None]] = []
         self._closed = False
 
@@ -97,8 +98,8 @@ class Hub:
     def address_or_problem(self) -> HubAddress:
         """Address, or problem, for new processes of this host.  The first call opens the socket.
 
-        If that fails it is not tried again: those who clean up after us know the directory, or that
-        there is none, from the first child on.  Any thread.
+        A failure is final: from the first child on, the processes that clean up know the directory
+        or know that there is none.  Any thread.
         """
         if not self._opened:
             self._open_socket()
@@ -106,12 +107,12 @@ class Hub:
 
     @property
     def known_address(self) -> HubAddress | None:
-        """The same, if anybody was told yet."""
+        """Address of the hub if the socket was opened, else None."""
         return self._opened[0][0] if self._opened else None
 
     @property
     def directory(self) -> str | None:
-        """The socket's directory, once it is there."""
+        """Directory of the socket, once it is opened."""
         address = self.known_address
         return os.path.dirname(address.path) or None if address else None
 
@@ -120,13 +121,13 @@ class Hub:
         return self._loop.on_thread()
 
     def dial(self) -> socket.socket:
-        """A stream to this hub for its own process.  Any thread."""
+        """Return the socket of a new stream from this process to its hub.  Any thread."""
         ours, theirs = socketpair("using a pipe or queue of another host")
         self._loop.call_soon(self._admit, theirs)
         return without_timeout(QuietSocket(fileno=ours.detach()))
 
     def fetch(self, grant: bytes) -> list[Descriptor]:
-        """An object's descriptors, for this very process.  Any thread: it waits for the loop."""
+        """Return an object's descriptors for this process.  Any thread; waits for the loop."""
         if self._loop.on_thread():
             return list(map(own, self.registry.fetch(grant)))
         answers: SimpleQueue[list[Descriptor] | Exception] = SimpleQueue()
@@ -148,9 +149,9 @@ class Hub:
             answers.put(error)
 
     def link(self, host: str | None, send: SendHubMessage, *, dialer: bool) -> HubLink:
-        """The hub of ``host`` can be reached by frames that go out by ``send``.
+        """Add a link to the hub of ``host``; ``send`` sends its messages.
 
-        None stands for every host that has no link of its own, as an agent's link to the master.
+        None stands for every host without a link here, as for an agent's link to the master.
         """
         link = HubLink(self._loop.call_soon, send)
         link.memory = self.replicas.link(host, send, dialer=dialer)
@@ -158,20 +159,20 @@ class Hub:
         return link
 
     def unlink(self, host: str | None, reason: str) -> None:
-        """Forget the link to a host, which has ended, and close its streams with ``reason``."""
+        """Remove the link to ``host``, which has ended, and close its streams with ``reason``."""
         self._router.unlink(host, reason)
         self.replicas.unlink(host, reason)
 
     def connect(self, host: str, stream: Stream) -> None:
-        """Lead ``stream`` to the hub of ``host``."""
+        """Connect ``stream`` to the hub of ``host``."""
         self._router.connect(host, stream)
 
     def ended(self, handler: ClientHandler) -> None:
-        """A handler is over."""
+        """Forget a handler that has ended."""
         self._handlers.discard(handler)
 
     def close(self) -> None:
-        """End all streams, let go of all objects, leave no file.  On the loop, or after its end."""
+        """End all streams, drop all objects, remove all files.  On the loop, or after its end."""
         if self._closed:
             return
         self._closed = True
@@ -204,7 +205,7 @@ class Hub:
             self._opened.append(opened)
         finally:
             if not self._opened or self._opened[0] is not opened:
-                # Another thread was faster, or whoever interrupted this one.
+                # Another thread, or a handler that interrupted this one, was faster.
                 self._loop.unregister(listener.fileno())
                 listener.close()
                 remove_directory(os.path.dirname(path))
@@ -217,7 +218,7 @@ class Hub:
         except OSError as error:
             if error.errno not in (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM):
                 raise
-            # Who knocked waits; without this pause the loop would do nothing else.
+            # The client still waits.  Without this pause the loop would spin.
             self._loop.unregister(listener.fileno())
             self._loop.call_later(_ACCEPT_AGAIN, self._listen_again, listener)
             return
@@ -261,8 +262,10 @@ class Hub:
 
 
 def _listen(parent: str | None, directory: str | None) -> tuple[socket.socket, str]:
-    """Make a socket in a new directory: ``directory``, or one in ``parent`` or the system's place
-    for such.
+    """Return a listening socket and its path, in a new directory.
+
+    The directory is ``directory``, or a temporary one in ``parent``, or else in the system's folder
+    for temporary files.
     """
     if directory is None:
         directory = tempfile.mkdtemp(prefix="fiber-", dir=parent)
@@ -283,9 +286,9 @@ def _listen(parent: str | None, directory: str | None) -> tuple[socket.socket, s
 def _problem(error: OSError) -> str:
     return (
         "no pipe, queue, lock or value can be shared with another process of this host: Fiber "
-        f"keeps a socket for them in a temporary directory, and there can be none ({error}). Set "
-        "FIBER_RUNTIME_DIRECTORY (runtime_directory) to a directory that can be written to and has "
-        "a short path, and start the program again"
+        f"needs a socket in a temporary directory, and cannot make it ({error}). Set "
+        "FIBER_RUNTIME_DIRECTORY (runtime_directory) to a writable directory with a short path, "
+        "and start the program again"
     )
 
 
@@ -293,9 +296,9 @@ SendHubMessage = Callable[[HubMessage], None]
 
 
 class HubLink:
-    """Side of a link between two hubs.  Runs on the loop's thread.
+    """Hub's part of a link to another host.  Runs on the loop's thread.
 
-    Whatever else is sent over the link has to be preceded by ``flush``.
+    Call ``flush`` before any other message is sent over the link.
     """
 
     memory: MemoryLink
@@ -307,24 +310,24 @@ class HubLink:
         self._waiting: deque[TunnelFrame] = deque()
 
     def on_frame(self, frame: HubMessage) -> None:
-        """A frame of the other side's hub."""
+        """Take a message of the other side's hub."""
         if isinstance(frame, MemoryMessage):
             self.memory.on_frame(frame)
         else:
             self.tunnels.on_frame(frame)
 
     def send(self, frame: TunnelFrame) -> None:
-        """Send a frame of a tunnel, after what has changed in shared memory."""
+        """Send a frame of a tunnel, after the changes of shared memory."""
         if not self.memory and not self._waiting:
             self._send(frame)
             return
-        # To look for changes takes time: once for all frames of a turn of the loop.
+        # To look for changes takes time, so do it once for all frames of a turn of the loop.
         self._waiting.append(frame)
         if len(self._waiting) == 1:
             self._call_soon(self.flush)
 
     def flush(self) -> None:
-        """Send what has changed in shared memory, and what waits for that."""
+        """Send the changes of shared memory, and the frames that wait for that."""
         self.memory.flush()
         while self._waiting:
             self._send(self._waiting.popleft())

@@ -1,4 +1,4 @@
-"""Channels and counters of this host with many holders, of which some can wait and some cannot.
+"""Channels and counters of this host that several processes hold.
 
 A *one-way channel* holds as many unread messages as a pipe does.  The kernel counts about 800 bytes
 of a socket's buffer for every packet, so a socket holds fewer small messages than a pipe.  Messages
@@ -8,17 +8,17 @@ the socket are older than those in the backlog::
     SendingEnd ──┬─ the backlog is empty ──► socket ────────────┬─► ReceivingEnd
                  └─ the socket is full ────► backlog, wake-up ──┘
 
-* As long as nothing overflows, neither end takes a lock or needs another system call.
-* While there is a backlog, its socket holds a *wake-up* packet behind all messages, so that its
-  descriptor is readable and a receiver that sleeps wakes.  A receiver finds the packet at the head
-  of the socket and takes from the backlog.  In the packet is a descriptor of the sending end:
-  a receiver that has removed it sends it again, and wakes the next one.
-* A sender that has checked the backlog a moment too early may send behind the wake-up packet.  It
-  notes that (``AMBIGUOUS``), and the next receiver moves the packet to the end.
+* Without a backlog, neither end takes a lock or needs another system call.
+* While there is a backlog, the socket holds a *wake-up* packet behind all messages, so that its
+  descriptor is readable and a sleeping receiver wakes.  A receiver that finds the packet at the
+  head of the socket takes a message from the backlog.  The packet has a descriptor of the sending
+  end.  With it the receiver sends the packet again and wakes the next receiver.
+* A sender that checked the backlog a moment too early may send behind the wake-up packet.  It notes
+  that (``AMBIGUOUS``), and the next receiver moves the packet to the end.
 * A sender that finds the backlog full waits for a packet in the other direction.
-* If a receiver dies while it has the wake-up packet, no message is lost, but other receivers are
-  not woken.  They look at the backlog each second, as the hub and the dealer of a queue do for
-  their readers, and the next sender finds the socket empty and sends another wake-up packet.
+* If a receiver dies while it has the wake-up packet, no message is lost, but other receivers do not
+  wake.  They look at the backlog each second; the hub and the dealer of a queue do so for their
+  readers.  The next sender finds the socket empty and sends another wake-up packet.
 """
 
 from __future__ import annotations
@@ -59,10 +59,10 @@ _Socket = TypeVar("_Socket", bound=socket.socket)
 
 
 class QuietSocket(socket.socket):
-    """A socket that closes without a warning when nobody holds it any more.
+    """Socket that is closed without a warning when its last reference is gone.
 
-    Queues and connections may be forgotten, as in multiprocessing, and garbage in cycles ends in
-    any order: the socket perhaps before whoever would close it.
+    As in multiprocessing, a program need not close queues and connections.  The garbage collector
+    may end a socket before the object that would close it.
     """
 
     __slots__ = ()
@@ -72,26 +72,26 @@ class QuietSocket(socket.socket):
 
 
 def without_timeout(sock: _Socket) -> _Socket:
-    """Free ``sock`` of the program's default timeout, which is for the user's own sockets."""
+    """Remove the program's default timeout, which is for the user's sockets, from ``sock``."""
     if sock.gettimeout() is not None:
         sock.settimeout(None)
     return sock
 
 
 class LocalChannel(UnixChannel):
-    """A channel that can also be asked not to wait, whoever else uses the same end."""
+    """Channel that can send and receive without waiting, also if others share its end."""
 
     __slots__ = ()
 
     can_try_send = True
 
     def post(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
-        """Send one message, waiting for room but not, as ``send``, until a bulky one is read."""
+        """Send one message.  Wait for room, but not until a bulky message is read."""
         packet.send(self._sock, payload, buffers, ballast=True)
 
     def try_send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
         """Send one message if there is room for it now."""
-        # The descriptor's own mode will not do: O_NONBLOCK is shared by all that hold the socket.
+        # O_NONBLOCK would not do: all holders of the socket share it.
         try:
             packet.send(self._sock, payload, buffers, ballast=True, wait=False)
             return True
@@ -106,7 +106,7 @@ class LocalChannel(UnixChannel):
         return True
 
     def recv_counting(self, counter: LocalCounter, *, wait: bool) -> Message | None:
-        """Receive a message, raising ``counter`` in the same step; None if there is none."""
+        """Receive a message and raise ``counter`` in one step; None if there is no message."""
         try:
             return packet.receive(self._sock, wait=wait, then=counter.raising)
         except BlockingIOError:
@@ -114,25 +114,25 @@ class LocalChannel(UnixChannel):
 
     @property
     def room_events(self) -> int:
-        """Event of ``fileno()`` after which ``try_send`` is worth another try."""
+        """Event of ``fileno()`` after which ``try_send`` may succeed."""
         return select.POLLOUT
 
 
 class LocalCounter(UnixCounter):
-    """A counter whose every change can be waited for."""
+    """Counter that also lets callers wait for each change."""
 
     __slots__ = ("raising",)
 
     def __init__(self, owner: Descriptor) -> None:
         super().__init__(owner)
         self.raising = partial(os.eventfd_write, owner.fileno(), 1)
-        """``add``, as a function of C."""
+        """``add(1)``, as a C function."""
 
     def claim(self, timeout: float | None, taken: list[Any], claims: Claimant) -> bool:
         """Take one as ``take`` does, and record it in ``claims``."""
         deadline = None if timeout is None else time.monotonic() + timeout
         while True:
-            claims.add()  # first: who dies in between has noted one too many, not one too few
+            claims.add()  # first: after a death in between there is a note too many, not too few
             try:
                 if self.take(0, taken):
                     return True
@@ -148,7 +148,7 @@ class LocalCounter(UnixCounter):
         """Wait until the count is not ``since``; False when ``timeout`` is over."""
         deadline = None if timeout is None else time.monotonic() + timeout
         with select.epoll() as poller:
-            # Edge-triggered: each write wakes every waiter once, and none has to consume it.
+            # Edge-triggered: each write wakes every waiter once, and no waiter has to consume it.
             poller.register(self._fd, select.EPOLLIN | select.EPOLLET)
             while self.value() == since:
                 left = None if deadline is None else deadline - time.monotonic()
@@ -161,16 +161,16 @@ class LocalCounter(UnixCounter):
 # One-way channels
 
 HEAD, TAIL = 8, 9
-"""Words.  Where they differ, there are records."""
+"""Words with the positions of the first record and of the end."""
 
 _NEEDED = 10
 """Word: free bytes that a sender waits for, or 0.  While it waits, no other sender puts."""
 
 AMBIGUOUS = 11
-"""Word: whether the socket has messages behind a wake-up packet."""
+"""Word: 1 if the socket has messages behind a wake-up packet."""
 
 UNANNOUNCED = 12
-"""Word: whether a wake-up packet is missing."""
+"""Word: 1 if a wake-up packet is missing."""
 
 ROOM = 13
 """Word: the usual size of the socket's buffer."""
@@ -183,7 +183,10 @@ _Result = TypeVar("_Result")
 
 
 class Backlog:
-    """The ring, as this process sees it.  Changed only within ``run``."""
+    """Ring buffer in shared memory, for messages that do not fit into the socket.
+
+    It is changed only within ``run``.
+    """
 
     __slots__ = ("_capacity", "_data", "_mutex", "block", "words")
 
@@ -196,13 +199,13 @@ class Backlog:
 
     @classmethod
     def create(cls) -> Backlog:
-        """Make an empty one."""
+        """Return a new backlog, which is empty."""
         new = cls(heap.allocate(_SIZE))
         new._mutex.create()
         return new
 
     def run(self, action: Callable[[], _Result]) -> _Result:
-        """Return what ``action`` returns, called while no other thread or process is in ``run``."""
+        """Call ``action`` while no other thread or process is in ``run``; return its result."""
         return self._mutex.run(action)
 
     def __bool__(self) -> bool:
@@ -215,7 +218,7 @@ class Backlog:
         return head + _LENGTH + self._length(head) == self.words[TAIL]
 
     def fits(self, size: int) -> bool:
-        """Tell whether a payload of ``size`` bytes fits in at all."""
+        """Tell whether a payload of ``size`` bytes fits into an empty backlog."""
         return size + _LENGTH <= self._capacity
 
     def put(self, payload: memoryview) -> bool:
@@ -228,12 +231,17 @@ class Backlog:
                 return False
             self._write(tail, memoryview(size.to_bytes(_LENGTH, "little")))
             self._write(tail + _LENGTH, payload)
-            if words[TAIL] == tail:  # else a finalizer or a signal's handler has put meanwhile
+            if (
+                words[TAIL] == tail
+            ):  # otherwise a finalizer or a signal's handler has put a record meanwhile
                 words[TAIL] = end
                 return True
 
     def take(self, say_room: Callable[[], None]) -> bytes:
-        """Remove the first record; first ``say_room`` if a sender waits and there will be room."""
+        """Remove and return the first record.
+
+        Call ``say_room`` before that if it makes the room that a sender waits for.
+        """
         words = self.words
         while True:
             head = words[HEAD]
@@ -242,14 +250,14 @@ class Backlog:
             payload = self._read(start, end)
             needed = words[_NEEDED]
             if needed and self._capacity - (words[TAIL] - end) >= needed:
-                say_room()  # first: after a death here a sender looks once in vain
+                say_room()  # first: after a death here the sender only looks once too often
                 words[_NEEDED] = 0
             if words[HEAD] == head:
                 words[HEAD] = end
                 return payload
 
     def need(self, size: int) -> None:
-        """Note that a sender waits for room: all of it where the payload does not fit in."""
+        """Note that a sender waits for room: for an empty backlog if the payload does not fit."""
         wanted = max(size + _LENGTH, self._capacity // 2)
         self.words[_NEEDED] = max(self.words[_NEEDED], min(wanted, self._capacity))
 
@@ -270,7 +278,7 @@ class Backlog:
 
 
 LOOK_AGAIN = 1.0
-"""Seconds after which a receiver that sleeps looks at the backlog."""
+"""Seconds after which a sleeping receiver looks at the backlog."""
 
 _DONTWAIT = int(socket.MSG_DONTWAIT)
 _PEEK = int(socket.MSG_PEEK) | _DONTWAIT
@@ -280,7 +288,7 @@ _RECEIVE_TIMEOUT = struct.pack("ll", int(LOOK_AGAIN), 0)
 
 
 class OneWayEnd(LocalChannel):
-    """End of a one-way channel: a socket, and the backlog that all holders of both ends share."""
+    """End of a one-way channel: a socket, and the backlog that holders of both ends share."""
 
     __slots__ = ("_words", "backlog")
 
@@ -293,7 +301,7 @@ class OneWayEnd(LocalChannel):
 
 
 class SendingEnd(OneWayEnd):
-    """The end that sends."""
+    """Sending end of a one-way channel."""
 
     __slots__ = ("_room_events",)
 
@@ -304,7 +312,7 @@ class SendingEnd(OneWayEnd):
         self._room_events = 0
 
     def send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
-        """Send one message, waiting for room; a bulky one until it is read."""
+        """Send one message.  Wait for room; after a bulky message, wait until it is read."""
         bulky = self._send_now(payload, buffers)
         if bulky is None:
             self._send_in_turn(payload, buffers)
@@ -315,7 +323,7 @@ class SendingEnd(OneWayEnd):
     send_unconfirmed = send
 
     def post(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
-        """Send one message, waiting for room but not until it is read."""
+        """Send one message.  Wait for room, but not until it is read."""
         if self._send_now(payload, buffers) is None:
             self._send_in_turn(payload, buffers)
 
@@ -328,11 +336,14 @@ class SendingEnd(OneWayEnd):
 
     @property
     def room_events(self) -> int:
-        """Event of ``fileno()`` after which ``try_send`` is worth another try."""
+        """Event of ``fileno()`` after which ``try_send`` may succeed."""
         return self._room_events or select.POLLOUT
 
     def _send_now(self, payload: BytesLike, buffers: Sequence[memoryview]) -> bool | None:
-        """Send through the socket, if it is the turn of that; True: the message is bulky."""
+        """Send through the socket unless there is a backlog; None if it was not sent.
+
+        True means that the message is bulky.
+        """
         words = self._words
         if words[HEAD] != words[TAIL]:
             return None
@@ -351,7 +362,7 @@ class SendingEnd(OneWayEnd):
     # Within ``backlog.run``
 
     def _place(self, payload: BytesLike, buffers: Sequence[memoryview]) -> int:
-        """Send the message or put it into the backlog: 0, or the event to wait for first."""
+        """Send the message or put it into the backlog; return 0, or an event to wait for."""
         is_first = not self.backlog
         if is_first:
             with contextlib.suppress(BlockingIOError):
@@ -371,23 +382,23 @@ class SendingEnd(OneWayEnd):
         return 0
 
     def _forget_room(self) -> None:
-        """Remove what receivers have said about room; BrokenPipeError if all are gone."""
+        """Remove old notices of room from the socket; BrokenPipeError if no receiver is left."""
         try:
             while self._sock.recv(1, _DONTWAIT):
                 pass
         except BlockingIOError:
             return
-        except ConnectionResetError:  # they left messages unread
+        except ConnectionResetError:  # receivers closed and left messages unread
             pass
         raise BrokenPipeError("the other end is closed")
 
     def _nothing_unread(self) -> bool:
-        """Tell whether the socket is empty: then its wake-up packet is lost."""
+        """Tell whether the socket is empty, so that its wake-up packet is lost."""
         return fcntl.ioctl(self._sock, termios.TIOCOUTQ, bytes(_INT.size)) == bytes(_INT.size)
 
 
 class ReceivingEnd(OneWayEnd):
-    """The end that receives."""
+    """Receiving end of a one-way channel."""
 
     __slots__ = ()
 
@@ -421,7 +432,7 @@ class ReceivingEnd(OneWayEnd):
         return self._next(wait=False)
 
     def poll(self, timeout: float | None) -> bool:
-        """Tell whether ``recv`` would return or raise at once."""
+        """Wait until ``recv`` would return or raise at once; False after ``timeout`` seconds."""
         deadline = None if timeout is None else time.monotonic() + timeout
         while not self.backlog:
             left = LOOK_AGAIN if deadline is None else deadline - time.monotonic()
@@ -432,7 +443,7 @@ class ReceivingEnd(OneWayEnd):
         return True
 
     def _next(self, *, wait: bool, passing: bool = False) -> Message | None:
-        """Return the next message, or None: at once, or after a while."""
+        """Return the next message, or None if there is none; with ``wait``, None after a while."""
         while True:
             if self.backlog:
                 message = self._take()
@@ -452,9 +463,9 @@ class ReceivingEnd(OneWayEnd):
                     return message
 
     def _take(self, sender: Descriptor | None = None) -> Message | None:
-        """Return the next message of socket and backlog; None if there is no backlog.
+        """Return the oldest message of socket and backlog; None if there is no backlog.
 
-        ``sender`` is that of a wake-up packet that the caller has removed.
+        ``sender`` is the descriptor in a wake-up packet that the caller has removed.
         """
         return self.backlog.run(partial(self._take_in_order, sender))
 
@@ -472,14 +483,14 @@ class ReceivingEnd(OneWayEnd):
             try:
                 message = packet.receive(self._sock, wait=False)
             except packet.WakeUp as wake_up:
-                # Others may have removed it first.  The last record goes without one.
+                # Another receiver may have been faster.  The last record needs no wake-up packet.
                 sender = wake_up.sender
                 if words[AMBIGUOUS]:
                     words[AMBIGUOUS] = False
                     self._pass_on(sender)
                     sender = None
             except (BlockingIOError, ConnectionClosed):
-                pass  # another receiver has taken what was there
+                pass  # another receiver has taken the message
             else:
                 if sender is not None:
                     self._pass_on(sender)
@@ -487,7 +498,7 @@ class ReceivingEnd(OneWayEnd):
         return None
 
     def _pass_on(self, sender: Descriptor) -> None:
-        # Without it, others are woken later.
+        # If this fails, other receivers wake later.
         with contextlib.suppress(OSError):
             _wake_up(BorrowedSocket(sender), self._words)
 
@@ -498,12 +509,12 @@ class ReceivingEnd(OneWayEnd):
                 return self._sock.recv(1, _PEEK)
             except BlockingIOError:
                 break
-            except ConnectionResetError:  # senders have left our packets unread; said once
+            except ConnectionResetError:  # senders closed and left packets unread; reported once
                 pass
         return b""
 
     def _say_room(self) -> None:
-        with contextlib.suppress(OSError):  # it was said already, or all senders are gone
+        with contextlib.suppress(OSError):  # there is a notice already, or no sender is left
             self._sock.send(b"\0", _DONTWAIT)
 
 
@@ -514,8 +525,8 @@ ENDS: dict[ObjectKind, type[SendingEnd | ReceivingEnd]] = {
 
 
 def one_way_pair() -> tuple[ReceivingEnd, SendingEnd]:
-    """Return the two ends of a new channel."""
-    backlog = Backlog.create()  # first: an error in there must not keep the sockets open
+    """Return the two ends of a new one-way channel."""
+    backlog = Backlog.create()  # first: if it raises, no socket is left open
     one, other = connected()
     receiver, sender = ReceivingEnd(one, backlog), SendingEnd(other, backlog)
     backlog.words[ROOM] = sender.sock.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF)
@@ -524,14 +535,14 @@ def one_way_pair() -> tuple[ReceivingEnd, SendingEnd]:
 
 
 def _wake_up(sock: socket.socket, words: memoryview) -> None:
-    """Send a wake-up packet, for which the socket's buffer grows for a moment."""
+    """Send a wake-up packet.  The socket's buffer grows for a moment to have room for it."""
     usual = words[ROOM]
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, usual)  # the kernel doubles it
     try:
         packet.send_wake_up(sock, sock.fileno())
         words[UNANNOUNCED] = False
     except BlockingIOError:
-        pass  # the system does not let it grow
+        pass  # the system does not let the buffer grow
     except ConnectionResetError as error:
         raise BrokenPipeError("the other end is closed") from error
     finally:

@@ -1,14 +1,15 @@
 """Messages on a stream to a hub, and the doorbell of a hub.
 
 A message is one packet.  Requests and replies are a few numbers.  The payload that a user sends or
-receives is in the packet's buffers, payload first, and nothing here is ever unpickled.
+receives is in the packet's buffers, payload first.  The hub never unpickles it.
 
-``HELLO`` comes first and is silent unless refused, as are ``CONNECT`` (go on to another host's hub;
-what follows is for that one, ``HELLO`` first) and ``ATTACH`` (what follows concerns one object).
-So a client opens a stream and makes its first request without waiting.  At most one request of a
-stream is unanswered; another one withdraws it.
+The first request is ``HELLO``.  ``CONNECT`` goes on to another host's hub, and the following
+requests are for that hub, ``HELLO`` first.  ``ATTACH`` chooses the object of the following
+requests.  A hub replies to these three only if it refuses them.  So a client opens a stream and
+sends its first request without waiting.  At most one request of a stream waits for its reply;
+another request withdraws it.
 
-Layout (little endian): request kind:u8, number:u32, and its own fields; reply the same.
+Layout (little endian): kind:u8, number:u32, and the fields of the request or reply.
 
 A process that changed shared memory rings the doorbell, and the hub looks at the memory.
 """
@@ -27,7 +28,7 @@ SECRET_BYTES = 16
 """Length of grants, tokens and identities: 128 bits, which cannot be guessed."""
 
 NO_SECRET = bytes(SECRET_BYTES)
-"""Stands for none."""
+"""Value that stands for no secret."""
 
 
 class HubAddress(NamedTuple):
@@ -35,10 +36,10 @@ class HubAddress(NamedTuple):
 
     host: str
     path: str
-    """Path of its unix socket; empty if it could not open one."""
+    """Path of the hub's unix socket; empty if it could not open one."""
     key: bytes
     problem: str = ""
-    """Reason why it could not, and what to do."""
+    """Text that says why it could not open a socket, and what to do."""
 
     def __repr__(self) -> str:
         return f"HubAddress(host={self.host!r}, path={self.path!r})"
@@ -49,17 +50,17 @@ class ObjectKind(IntEnum):
 
     CHANNEL = 1
     COUNTER = 2
-    # What is a block of shared memory
+    # Blocks of shared memory
     MEMORY = 3
     SEMAPHORE = 4
     WAIT_LIST = 5
-    # A channel's end and, beside it, a block
+    # Ends of a one-way channel, each with a block
     SENDER = 6
     RECEIVER = 7
 
 
 class Extent(NamedTuple):
-    """Part of a segment that an object is."""
+    """Position and size of an object in its segment."""
 
     offset: int = 0
     size: int = 0
@@ -70,14 +71,14 @@ WHOLE = Extent()
 
 
 class GrantFlags(IntFlag):
-    """Life of a grant."""
+    """Flags that say how long a grant lasts."""
 
-    REUSABLE = 1  # beyond its first use
-    ENDS_WITH_STREAM = 2  # with the one on which it was asked for
+    REUSABLE = 1  # it does not end with its first use
+    ENDS_WITH_STREAM = 2  # it ends with the stream on which it was requested
 
 
 class Op(IntEnum):
-    """Requests."""
+    """Kind of a request."""
 
     HELLO = 1  # version, key
     CONNECT = 2  # host
@@ -86,17 +87,17 @@ class Op(IntEnum):
     ATTACH = 5  # token, grant: the token is for more streams of the same user, without a grant
     GRANT = 6  # flags, token -> grant, identity
     RELEASE = 7  # grant; silent
-    CANCEL = 8  # answers the request of this number NO, if it is still waiting; otherwise silent
-    SYNC = 9  # number of the request that is given up, or 0: takes back what it got -> nothing
-    RING = 30  # something in shared memory of this host has changed; silent
-    REPLICATE = 31  # an Origin beside it -> where in the segment whose descriptor is beside it
+    CANCEL = 8  # number of a request: replies NO to it if it still waits; otherwise silent
+    SYNC = 9  # number of a request that is given up, or 0: takes back its token -> nothing
+    RING = 30  # shared memory of this host has changed; silent
+    REPLICATE = 31  # an Origin beside it -> offset in the segment whose descriptor is beside it
     # For an attached channel
     SEND = 10  # payload and buffers beside it
     RECV = 11  # -> more; payload and buffers beside it
     TRY_RECV = 12  # -> the same, or NO
     POLL = 13
     WATCH = 14  # silent; the stream gets READY once the channel is readable
-    CHECK = 15  # whether it is readable now; then as WATCH
+    CHECK = 15  # NO if it is not readable now; then as WATCH
     DRAW = 16  # token of a counter -> as RECV; raises that counter by one
     TRY_DRAW = 17  # the same -> as TRY_RECV
     # For an attached counter
@@ -106,45 +107,45 @@ class Op(IntEnum):
     VALUE = 23  # -> count
     WAIT = 24
     CHANGED = 25  # since
-    CLAIM = 26  # as TAKE; taken back at the end of the stream or the next request, unless
-    KEEP = 27  # says before that it is to be kept; silent
+    CLAIM = 26  # as TAKE; undone at the end of the stream or at the next request, except
+    KEEP = 27  # which keeps it; silent
     # For an attached semaphore
-    ACQUIRE = 40  # the process's name beside it -> whether the stream keeps it; who died beside it
-    POST = 41  # NO if there are as many tokens as there can be
-    TOKENS = 42  # -> how many there are
+    ACQUIRE = 40  # name of the process beside it -> 1 if the stream keeps it; dead holder beside it
+    POST = 41  # NO if the semaphore is at its maximum
+    TOKENS = 42  # -> number of tokens
     # For an attached wait list
     ENTER = 50
     SLEEP = 51
     LEAVE = 52  # NO if the stream's place was not notified
-    NOTIFY = 53  # how many
-    WAITERS = 54  # -> how many
-    BURY = 55  # -> how many
+    NOTIFY = 53  # number of waiters
+    WAITERS = 54  # -> number of waiters
+    BURY = 55  # -> number of waiters that died
     GET = 56  # which -> the word
     SET = 57  # which, the word
-    HOLD = 58  # how many things the stream's place has; silent
-    RECLAIM = 59  # token of a counter, which is raised by -> how many things the dead had
-    TALLY = 60  # how many things the stream's place has; the second word
-    HELD = 61  # -> how many things all places have
+    HOLD = 58  # number of things of the stream's process; silent
+    RECLAIM = 59  # token of a counter, which is raised by -> number of things of dead processes
+    TALLY = 60  # number of things of the stream's process; the second word
+    HELD = 61  # -> number of things of all processes
 
 
 class Status(IntEnum):
-    """Replies."""
+    """Kind of a reply."""
 
     OK = 0
-    NO = 1  # cancelled, or not so
+    NO = 1  # cancelled, or false
     EOF = 2
     BROKEN = 3
-    READY = 4  # of a watching stream; answers nothing
-    GONE = 5  # why the stream ends
+    READY = 4  # sent to a watching stream; replies to no request
+    GONE = 5  # the stream ends; the reason follows
 
 
 class Origin(NamedTuple):
-    """A block of shared memory, and what entitles a process to it."""
+    """Block of shared memory, and the permission to use it."""
 
     home: str
-    """The host where it was made."""
+    """Host where the block was made."""
     identity: bytes
-    """Secret that tells it from all other blocks: only its users know it."""
+    """Secret name of the block, which only its users know."""
     size: int
     token: bytes
     grant: bytes
@@ -163,7 +164,7 @@ class Origin(NamedTuple):
 
     @classmethod
     def decode(cls, data: memoryview) -> Origin:
-        """The same back; struct.error or ValueError for what is none."""
+        """Decode what ``encode`` returned; struct.error or ValueError for other bytes."""
         return cls(str(data[_ORIGIN.size :], "utf-8"), *_ORIGIN.unpack_from(data))
 
 
@@ -181,34 +182,34 @@ GRANTING = struct.Struct(f"<BIQ{_SECRET}")
 
 
 def hello(key: bytes) -> bytes:
-    """The first message of every stream."""
+    """Return the first message of a stream."""
     return HELLO.pack(Op.HELLO, 0, VERSION, key)
 
 
 def connect(host: str) -> bytes:
-    """Go on to the hub of ``host``."""
+    """Return the message that connects a stream to the hub of ``host``."""
     return HEAD.pack(Op.CONNECT, 0) + host.encode()
 
 
 def gone(reason: str) -> bytes:
-    """The last message of a stream that a hub ends."""
+    """Return the last message of a stream that a hub ends."""
     return HEAD.pack(Status.GONE, 0) + reason.encode(errors="replace")
 
 
 def text(payload: memoryview) -> str:
-    """Return the text after the numbers of CONNECT and GONE."""
+    """Return the text in a CONNECT or GONE message."""
     return str(payload[HEAD.size :], "utf-8", "replace")
 
 
 class Doorbell:
-    """Doorbell of one hub.  Runs on the loop's thread, but for ``ring``."""
+    """Doorbell of one hub.  Runs on the loop's thread, except ``ring``."""
 
     def __init__(self, call_soon: Callable[..., None]) -> None:
         self._call_soon = call_soon
         self._listeners: set[Callable[[], None]] = set()
 
     def listen(self, listener: Callable[[], None]) -> None:
-        """Call it whenever the bell is rung, and perhaps for nothing."""
+        """Call ``listener`` whenever the bell rings, also if its memory did not change."""
         self._listeners.add(listener)
 
     def forget(self, listener: Callable[[], None]) -> None:
@@ -216,7 +217,7 @@ class Doorbell:
         self._listeners.discard(listener)
 
     def ring(self) -> None:
-        """Have all listeners look.  Any thread; waits for nothing."""
+        """Have all listeners called.  Any thread; never waits."""
         self._call_soon(self.rung)
 
     def rung(self) -> None:

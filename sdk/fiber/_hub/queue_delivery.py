@@ -6,9 +6,9 @@ for it.  The slot of an item that was sent becomes free when the item is receive
 not sent yet is in the memory of its process, and is lost when the process dies.  So each process
 keeps the number of its unsent items in a table in shared memory, where other processes find it.
 
-A *dealer* gives the items to the readers in turn, before they ask::
+A *dealer* sends the items to the readers in turn, before they request them::
 
-    put ── inbox ──► Dealer, a thread of the queue's maker ──┬─► a reader's own channel ──► get
+    put ── inbox ──► Dealer, a thread of the queue's maker ──┬─► the channel of a reader ──► get
                            ▲                                 └─► another reader's
     the first get ── arrivals
 """
@@ -43,21 +43,21 @@ from fiber._wire.packet import Message
 from fiber.errors import ConnectionClosed
 
 _LOOK_FOR_THE_DEAD = 1.0
-"""Seconds that ``put`` waits at a time."""
+"""Seconds that ``put`` waits before it looks for dead processes."""
 
 _COUNT_AGAIN = 0.2
-"""Seconds between two looks whether there are too many places."""
+"""Seconds between two checks for surplus slots."""
 
 _MOVE = 1e-4
-"""Seconds to wait while an item moves: its thread may have to wait for a processor."""
+"""Seconds to wait while an item moves, as its thread may wait for a processor."""
 
 
 class QueueSlots:
-    """The places of a queue with a maximum size: a count of those that are free.
+    """Slots of a queue with a maximum size: the count of free ones.
 
-    The places of a process that dies before it has sent its items become free again.  If it dies
-    while one is under way, that place may become free as well, and there is one too many until the
-    queue is empty.
+    If a process dies before it has sent its items, their slots become free again.  If it dies while
+    it sends an item, the slot of that item may become free too.  Then there is a surplus slot until
+    the queue is empty.
     """
 
     def __init__(self, maximum: int) -> None:
@@ -67,7 +67,7 @@ class QueueSlots:
         self._next_count = math.inf
 
     def take(self, timeout: float | None, taken: list[Any]) -> bool:
-        """Take a place for an item, and note it in ``taken``; False if none gets free in time."""
+        """Take a slot for an item and note it in ``taken``; False if none gets free in time."""
         now = time.monotonic()
         if now > self._next_count:
             self._next_count = now + _COUNT_AGAIN
@@ -81,23 +81,23 @@ class QueueSlots:
                 return False
 
     def give_back(self) -> None:
-        """The item is not sent after all."""
+        """Free the slot of an item that is not sent."""
         self._free.add(1)
         self._claims.drop()
-        self._next_count = 0.0  # a put that was interrupted may give a place back twice
+        self._next_count = 0.0  # an interrupted put may free a slot twice
 
     def sending(self) -> None:
-        """The item leaves this process."""
+        """Note that an item leaves this process."""
 
     def not_sent(self) -> None:
-        """Note that the item was not sent yet, but will be."""
+        """Note that the item was not sent yet and is tried again."""
 
     def sent(self) -> None:
-        """Note that the item was sent: its place is free once it is received."""
+        """Note that the item was sent: its slot becomes free when it is received."""
         self._claims.drop()
 
     def receive(self, inbox: SharedChannel, *, wait: bool) -> Message | None:
-        """Receive an item, whose place is free then; None if there is none."""
+        """Receive an item and free its slot; None if there is no item."""
         return inbox.recv_counting(self._free, wait=wait)
 
     def used(self, waiting: int) -> int:
@@ -105,11 +105,11 @@ class QueueSlots:
         return max(0, self._maximum - self._free.value())
 
     def full(self) -> bool:
-        """Tell whether no place is free."""
+        """Tell whether no slot is free."""
         return not self._free.wait(0) and not self._recover()
 
     def _recover(self) -> bool:
-        """Make the places of dead processes free; whether there were any."""
+        """Free the slots of dead processes; return whether there were any."""
         lost = self._claims.recover(self._free)
         if lost:
             self._next_count = 0.0
@@ -117,42 +117,43 @@ class QueueSlots:
 
     def _remove_excess(self) -> None:
         while self._free.value() > self._maximum and self._free.take(0):
-            if self._free.value() < self._maximum:  # another process has removed it as well
+            if self._free.value() < self._maximum:  # another process has removed a surplus slot too
                 self._free.add(1)
                 return
 
 
 class ItemCount:
-    """The places of a queue without a maximum: only items that have left their process count.
+    """Count of the items of a queue without a maximum that have left their process.
 
-    Its operations while a feeder runs are none: a system call lets go of the interpreter, and two
-    threads that take it from each other at every item are several times slower than one.
+    It makes no system call for an item while a feeder runs.  A system call releases the
+    interpreter, and two threads that take it from each other at each item are several times slower
+    than one.
     """
 
     def __init__(self) -> None:
         self._sent: SharedCounter = LocalCounter.create()
 
     def take(self, timeout: float | None, taken: list[Any]) -> bool:
-        """Take a place, of which there is always one."""
+        """Take a slot.  There is always one."""
         taken.append(1)
         return True
 
     def give_back(self) -> None:
-        """The item is not sent after all."""
+        """Free the slot of an item that is not sent."""
 
     def sending(self) -> None:
-        """The item leaves this process.  Before it does: its receiver takes off the count."""
+        """Count an item before it leaves this process.  Its receiver lowers the count."""
         self._sent.add(1)
 
     def not_sent(self) -> None:
-        """Note that the item was not sent yet, but will be."""
+        """Note that the item was not sent yet and is tried again."""
         self._sent.take(0)
 
     def sent(self) -> None:
         """Do nothing: ``sending`` has counted the item."""
 
     def receive(self, inbox: SharedChannel, *, wait: bool) -> Message | None:
-        """Receive an item, which counts no longer; None if there is none."""
+        """Receive an item and lower the count; None if there is no item."""
         message = inbox.recv() if wait else inbox.try_recv()
         if message is not None:
             self._sent.take(0)
@@ -163,18 +164,18 @@ class ItemCount:
         return self._sent.value() + waiting
 
     def full(self) -> bool:
-        """Never."""
+        """Return False: there is always a slot."""
         return False
 
 
 class Feeder:
-    """Sends what did not fit into the channel when it was put, on a thread of its own.
+    """Sender of the items that did not fit into the channel when they were put.
 
-    It ends with its ``owner``, a queue, which it does not hold; nor does it hold the end that
-    reads: once nobody can ever read, nothing has to be waited for.
+    It has a thread, which ends with its ``owner``, a queue.  The feeder has no reference to the
+    queue, nor to the reading end: when no process can read any longer, it does not have to wait.
 
-    No lock: ``put`` may be interrupted at any line by a finalizer or a signal's handler that puts
-    into the same queue, or raises.  What they share are operations that the interpreter does whole.
+    There is no lock: a finalizer or a signal's handler may interrupt ``put`` at any step, put into
+    the same queue, and raise.  Shared state changes by single steps of the interpreter.
     """
 
     def __init__(
@@ -197,25 +198,25 @@ class Feeder:
         self._sending = False
         self._thread = 0
         self._moves = 0  # odd while an item is counted neither here nor there
-        # What a thread takes out before it feeds.  Whoever finds it there starts a thread; of two,
-        # the second one ends.
+        # A thread takes the entry out before it feeds.  A caller that finds the entry starts a
+        # thread.  If two callers do, the second thread ends.
         self._vacancy = [True]
         self._joins: list[util.Finalize] = []
         self._join_cancelled = False
 
     def put(self, payload: bytes, buffers: list[memoryview], taken: list[Any]) -> None:
-        """Send a message now if it is its turn and there is room, otherwise later.
+        """Send a message now if no item waits and there is room, otherwise later.
 
-        ``taken`` notes its place, and is emptied once that is ours to give back.
+        ``taken`` has a note of its slot, and is emptied when the feeder has the slot.
         """
-        # In this order: what the feeder has taken out, it had said before that it is sending.
+        # In this order: before the feeder takes an item out, it notes that it is sending.
         nothing_to_overtake = not self._unsent and not self._sending
         if nothing_to_overtake and self._outbox.can_try_send and self._send_now(payload, buffers):
             taken.clear()
             return
-        # The arrays behind the buffers are their owner's to change once ``put`` has returned.
+        # The caller may change the arrays behind the buffers when ``put`` has returned.
         taken[:] = None, (payload, packet.kept(buffers))
-        self._unsent.extend(iter(taken.pop, None))  # from there to here, with no handler in between
+        self._unsent.extend(iter(taken.pop, None))  # moved in one step: no handler runs in between
         self._wake.put(True)
         if self._vacancy:
             self._start_thread()
@@ -226,7 +227,9 @@ class Feeder:
             moves = self._moves
             size = self._slots.used(len(self._unsent))
             none_moved = moves == self._moves and not moves % 2
-            if none_moved or threading.get_ident() == self._thread:  # then we interrupted the move
+            if (
+                none_moved or threading.get_ident() == self._thread
+            ):  # then this call interrupted the move
                 return size
             time.sleep(_MOVE)
 
@@ -243,21 +246,21 @@ class Feeder:
         return False
 
     def close(self) -> None:
-        """Take no more; let go of the channel once everything is sent."""
+        """Accept no more items; close the channel when all items are sent."""
         if self._vacancy and not self._unsent:
             self._close_outbox()
             return
-        if self._vacancy:  # a ``put`` was interrupted before it started the thread
+        if self._vacancy:  # an interrupted ``put`` has not started the thread
             self._start_thread()
         self._wake.put(False)
 
     def join(self) -> None:
-        """Wait until everything is sent."""
+        """Wait until all items are sent."""
         for join in self._joins:
             join()
 
     def cancel_join(self) -> None:
-        """Do not wait for it when the process ends."""
+        """Do not wait for the feeder at the end of the process."""
         self._join_cancelled = True
         for join in self._joins:
             join.cancel()
@@ -291,7 +294,7 @@ class Feeder:
         self._close_outbox()
 
     def _count_as_sent(self) -> bool:
-        """False if who keeps the count is gone, and with it the queue."""
+        """Count an item as sent; False if the count is gone, and the queue with it."""
         try:
             self._slots.sending()
         except EOFError:
@@ -304,7 +307,7 @@ class Feeder:
             self._outbox.post(payload, buffers)
             self._slots.sent()
         except (BrokenPipeError, EOFError):
-            self._unsent.clear()  # nobody can ever read them
+            self._unsent.clear()  # no process can ever read them
         except OSError as error:
             self._failed(error)
 
@@ -316,13 +319,15 @@ class Feeder:
         else:
             try:
                 self._on_error(error, None)
-            except BaseException:  # The hook is the user's, and other items are to be sent.
+            except (
+                BaseException
+            ):  # The hook is the user's code.  Other items have to be sent all the same.
                 report_uncaught()
 
 
 def _join(thread: weakref.ref[threading.Thread]) -> None:
     running = thread()
-    if running is not None and running.ident is not None:  # otherwise it was not to be started
+    if running is not None and running.ident is not None:  # otherwise it could not be started
         running.join()
 
 
@@ -331,7 +336,7 @@ _LOOK = 0.2
 
 
 class SlotClaims:
-    """The table, and the claims of this process.  Any thread."""
+    """Table with the number of slots that each process holds.  Any thread may use it."""
 
     def __init__(self) -> None:
         self.__setstate__(
@@ -352,22 +357,22 @@ class SlotClaims:
         self._entry: list[Any] = []
 
     def add(self) -> None:
-        """Note that this process has taken a place."""
-        if self._pid != os.getpid():  # a fork: what its parent has is not its own
+        """Note that this process has taken a slot."""
+        if self._pid != os.getpid():  # a fork does not hold its parent's slots
             self._begin()
         self._own.append(None)
-        self._tell()
+        self._publish()
 
     def drop(self) -> None:
-        """Note that this process has one place less: the item was sent, or the place given back."""
+        """Note that this process has one slot less: its item was sent, or it was freed."""
         try:
             self._own.pop()
-        except IndexError:  # interrupted before it was noted
+        except IndexError:  # an interrupt came before ``add`` noted it
             return
-        self._tell()
+        self._publish()
 
     def recover(self, counter: SharedCounter) -> int:
-        """Give the places of dead processes back to ``counter``; return how many there were."""
+        """Add the slots of dead processes to ``counter``; return their number."""
         now = time.monotonic()
         if now < self._next_look:
             return 0
@@ -378,7 +383,7 @@ class SlotClaims:
         finally:
             self._lock.release()
 
-    def _tell(self) -> None:
+    def _publish(self) -> None:
         if not self._entry:
             self._enter()
         if not self._entry:
@@ -388,15 +393,17 @@ class SlotClaims:
             while True:
                 count = len(own)
                 self._table.hold(entry, count)
-                if count == len(own):  # else another thread may have told the old number last
+                if count == len(
+                    own
+                ):  # otherwise another thread may have written an older number last
                     return
         except (OSError, ObjectUnreachable):
-            pass  # the hub is gone, and the queue with it
+            pass  # the hub has ended, and the queue with it
 
     def _enter(self) -> None:
         self._lock.acquire()
         try:
-            with suppress(OSError):  # there are too many processes: this one is not watched
+            with suppress(OSError):  # the table is full: this process has no entry
                 self._entry.append(self._table.enter())
                 weakref.finalize(self, self._table.dismiss, self._entry[-1])
         finally:
@@ -406,14 +413,14 @@ class SlotClaims:
 # Dealing to readers
 
 _LOOK_AGAIN = 0.5
-"""Seconds after which a reader that arrives looks whether anybody is there."""
+"""Seconds between checks of a new reader that the dealer is alive."""
 
 
 class Dealer:
-    """Deals what comes by ``inbox`` to those who come by ``arrivals``, until ``inbox`` ends.
+    """Thread that sends the items of ``inbox`` to the readers that come by ``arrivals``.
 
-    Each item goes to the next reader that has room for it; without one it waits, and the others
-    behind it in ``inbox``.
+    Each item goes to the next reader with room for it.  Without such a reader the item waits, and
+    later items wait in ``inbox``.  The dealer ends with ``inbox``.
     """
 
     def __init__(self, inbox: ReceivingEnd, arrivals: LocalChannel) -> None:
@@ -437,7 +444,7 @@ class Dealer:
                 if self._item is not None and self._deal(self._item):
                     self._item.release()
                     self._item = None
-        except ConnectionClosed:  # nobody has the queue any more
+        except ConnectionClosed:  # no process has the queue
             pass
         finally:
             for channel in (self._inbox, self._arrivals, *self._readers):
@@ -461,14 +468,14 @@ class Dealer:
             return
         try:
             answer: Channel = packet.loads(message)
-        except Exception:  # the reader is gone already
+        except Exception:  # the reader has ended already
             return
         theirs, ours = local.one_way_pair()
         with collecting_grants(reusable=False) as grants:
             invitation = pickle.dumps(theirs)
         try:
             answer.send(invitation)
-            answer.recv().release()  # it has it
+            answer.recv().release()  # the reader has its channel
             self._readers.append(ours)
         except (OSError, ConnectionClosed):
             ours.close()
@@ -483,7 +490,7 @@ class Dealer:
             reader = self._readers.popleft()
             try:
                 dealt = reader.try_send(item.payload, item.buffers)
-            except BrokenPipeError:  # it is gone
+            except BrokenPipeError:  # the reader has ended
                 reader.close()
                 continue
             self._readers.append(reader)
@@ -493,7 +500,10 @@ class Dealer:
 
 
 def arrive(arrivals: Channel) -> Channel:
-    """Become a reader: the channel on which the dealer sends.  ConnectionClosed if it is gone."""
+    """Become a reader; return the channel on which the dealer sends.
+
+    ConnectionClosed if the dealer has ended.
+    """
     ours, theirs = LocalChannel.pair()
     with collecting_grants(reusable=False) as grants:
         invitation = pickle.dumps(theirs)
@@ -501,10 +511,10 @@ def arrive(arrivals: Channel) -> Channel:
     try:
         arrivals.send(invitation)
         while not ours.poll(_LOOK_AGAIN):
-            if arrivals.poll(0):  # nothing ever comes there but the end
+            if arrivals.poll(0):  # no message comes there, so this is the end
                 raise ConnectionClosed()
         channel: Channel = ours.recv_object()
-        if isinstance(channel, RemoteObject):  # or the grant might be taken back before
+        if isinstance(channel, RemoteObject):  # otherwise the grant might end before that
             channel.confirm()
         ours.send(b"")
         return channel

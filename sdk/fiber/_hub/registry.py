@@ -1,10 +1,10 @@
 """Registry of the objects that a hub keeps for processes of other hosts.
 
-An object stays as long as someone on another host is attached to it or a grant for it is out.  A
-grant is the permission that travels inside a pickled handle: 128 random bits.  A plain one ends
-with its first use; a reusable one lasts until it is released.  A user that attaches by a grant
-brings a *token*, 128 random bits that it has chosen.  While it is attached, the token lets it
-attach again and grant the object to others.
+An object stays as long as a process of another host is attached to it, or there is a grant for it.
+A grant is the permission in a pickled handle: 128 random bits.  A plain grant ends with its first
+use; a reusable one lasts until it is released.  A process that attaches by a grant also sends a
+*token*, 128 random bits of its choice.  While it is attached, the token allows it to attach again,
+and to get grants for other processes.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ Hosted: TypeAlias = HostedChannel | HostedCounter | HostedMemory | HostedSemapho
 
 
 class NoSuchObject(LookupError):
-    """The grant was used up or released, or the user is not attached."""
+    """Error: the grant was used or released, or the user is not attached."""
 
 
 class SharedObject:
-    """A channel, counter or block of this host, while others may ask for it."""
+    """Channel, counter or block of this host that other processes may request."""
 
     __slots__ = (
         "__weakref__",
@@ -66,12 +66,12 @@ class SharedObject:
 
     @property
     def hosted(self) -> Hosted:
-        """Serves those who are attached."""
+        """Server for the attached streams."""
         assert self.server is not None
         return self.server
 
     def duplicates(self) -> list[int]:
-        """Duplicate its descriptors."""
+        """Return duplicates of the descriptors."""
         numbers: list[int] = []
         try:
             for descriptor in self._descriptors:
@@ -83,32 +83,32 @@ class SharedObject:
         return numbers
 
     def end_service(self) -> None:
-        """End the service: no stream is attached."""
+        """Stop serving the object, as no stream is attached."""
         server, self.server = self.server, None
         if server is not None:
             server.close()
 
 
 class ObjectAttachment(NamedTuple):
-    """Stream of a user of an object."""
+    """Attachment of one stream to an object."""
 
     shared: SharedObject
     token: bytes
 
 
 class Grant(NamedTuple):
-    """A permission to use an object."""
+    """Permission to use an object."""
 
     shared: SharedObject
     reusable: bool
 
 
 class Registry:
-    """The objects of one hub.  On the loop's thread, but for ``register`` and ``release``.
+    """Objects of one hub.  Runs on the loop's thread, except ``register`` and ``release``.
 
-    Those two take no lock and wait for nothing, so that a finalizer or signal handler may come at
-    any line of them: they leave a note for the loop.  Nobody can come with a grant before the loop
-    has seen the note of it, since each method looks for notes first.
+    Those two take no lock and never wait, so a finalizer or signal handler may interrupt them at
+    any step.  They leave a note for the loop.  Each other method reads the notes first, so a grant
+    is known before a process can use it.
     """
 
     def __init__(
@@ -118,14 +118,14 @@ class Registry:
         self._call_soon = call_soon
         self._secret = os.urandom(SECRET_BYTES)
         self._registered: deque[tuple[bytes, Grant]] = deque()
-        # So that one descriptor does for an object, however often it is registered.  Of two threads
-        # that share it for the first time each may keep one: as good, but one too many.
+        # An object that is registered several times needs one descriptor.  Two threads may each
+        # register it first at the same time, and keep two, which does no harm.
         self._objects: weakref.WeakValueDictionary[tuple[int, ...], SharedObject] = (
             weakref.WeakValueDictionary()
         )
         self._grants: dict[bytes, Grant] = {}
         self._users: dict[bytes, list[SharedObject]] = {}
-        """Objects by the tokens of their users, with an entry for each stream."""
+        """Objects by the token of their user, with an entry for each stream."""
 
     def register(
         self,
@@ -136,9 +136,9 @@ class Registry:
         beside: Sequence[int] = (),
         reusable: bool,
     ) -> tuple[bytes, bytes]:
-        """Keep what ``fd`` refers to, which stays the caller's; a grant and its identity.
+        """Keep the object of ``fd``; return a grant for it and its identity.
 
-        ``beside`` are further descriptors that belong to it.
+        ``beside`` are further descriptors of the object.  The caller keeps its descriptors.
         """
         known = (kind, _identity(kind, fd), extent.offset)
         shared = self._objects.get(known)
@@ -153,21 +153,21 @@ class Registry:
         return grant, shared.identity
 
     def _identify(self, known: tuple[int, ...]) -> bytes:
-        """Return an object's identity, the same each time, even after the object was forgotten."""
+        """Return an object's identity, the same each time, also after it was forgotten."""
         return hmac.digest(self._secret, struct.pack("<3Q", *known), "sha256")[:SECRET_BYTES]
 
     def release(self, grants: Iterable[bytes]) -> None:
-        """Have the loop take ``grants`` back, which no process will use from now on."""
+        """Have the loop end ``grants``, which no process uses from now on."""
         self._call_soon(self.take_back, grants)
 
     def take_back(self, grants: Iterable[bytes]) -> None:
-        """Take ``grants`` back now."""
+        """End ``grants`` now."""
         self._settle()
         for grant in grants:
             self._grants.pop(grant, None)
 
     def grant(self, token: bytes, *, reusable: bool) -> tuple[bytes, bytes]:
-        """Make one more grant for the object of this token's user; return it and the identity."""
+        """Make a grant for the object of this token's user; return it and the identity."""
         shared = self._used_by(token)
         grant = os.urandom(SECRET_BYTES)
         self._grants[grant] = Grant(shared, reusable)
@@ -182,13 +182,13 @@ class Registry:
         return fds
 
     def attach(self, token: bytes, grant: bytes = NO_SECRET) -> ObjectAttachment:
-        """Attach a user on another host; ``detach`` ends that.
+        """Attach a stream of a user on another host, until ``detach``.
 
-        A user that is attached already may attach again with the same token and no grant.
+        A user that is attached may attach another stream with the same token and no grant.
         """
         shared = self._used_by(token) if grant == NO_SECRET else self._granted(grant)
         if self._users.get(token, [shared])[0] is not shared:
-            raise NoSuchObject("the token is already in use for something else")
+            raise NoSuchObject("the token is already in use for another object")
         if shared.server is None:
             with naming_the_limit("serving a pipe or queue to another host"):
                 shared.server = self._host(shared)
@@ -198,15 +198,15 @@ class Registry:
         return ObjectAttachment(shared, token)
 
     def hosted(self, token: bytes) -> Hosted:
-        """Return what the user of this token is attached to."""
+        """Return the server of the object that the user of this token is attached to."""
         return self._used_by(token).hosted
 
     def look_up(self, token: bytes, grant: bytes) -> SharedObject:
-        """Return the object that the user is attached to, or may attach to by this grant."""
+        """Return the object that the user is attached to or may attach to by this grant."""
         return self._used_by(token) if token in self._users else self._granted(grant)
 
     def detach(self, attachment: ObjectAttachment) -> None:
-        """Remove one stream."""
+        """Detach one stream."""
         shared, token = attachment
         streams = self._users[token]
         streams.pop()
@@ -217,7 +217,7 @@ class Registry:
             shared.end_service()
 
     def close(self) -> None:
-        """Let go of everything."""
+        """Drop all objects."""
         self._registered.clear()
         for streams in self._users.values():
             streams[0].end_service()
@@ -225,7 +225,7 @@ class Registry:
         self._grants.clear()
 
     def _settle(self) -> None:
-        """Enter what was registered meanwhile."""
+        """Read the notes of ``register``."""
         while self._registered:
             grant, granted = self._registered.popleft()
             self._grants[grant] = granted
@@ -253,8 +253,8 @@ _CHANNELS = (ObjectKind.CHANNEL, ObjectKind.SENDER, ObjectKind.RECEIVER)
 _WITHOUT_IDENTITY = (*_CHANNELS, ObjectKind.COUNTER)
 
 _NOT_THERE = (
-    "the pipe, queue or event that this handle stands for is not there any more: "
-    "the handle was used once already, or all of its holders have ended"
+    "the pipe, queue or other object of this handle is gone: the handle was used once already, "
+    "or all processes with the object have ended"
 )
 
 

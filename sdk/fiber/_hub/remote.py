@@ -1,7 +1,7 @@
-"""Channels and counters of another host: every operation is a request to the hub there.
+"""Channels and counters of another host: each operation is a request to the hub there.
 
-An operation has a stream for itself, so that threads which wait do not wait for each other.  There
-are as many streams as threads ever used the object at once.
+Each operation uses a stream alone, so threads that wait do not block each other.  An object has as
+many streams as threads have ever used it at the same time.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ from fiber._wire.packet import Message
 from fiber.errors import ConnectionClosed
 
 Taken: TypeAlias = "list[weakref.ref[RemoteObject]]"
-"""Objects of other hosts that something unpickled has brought here."""
+"""Objects of other hosts that an unpickling has made here."""
 
 _taken: Taken | None = None
 
 
 def loads(data: BytesLike, buffers: Iterable[BytesLike]) -> tuple[Any, Taken]:
-    """Unpickle; and what was taken with it, for ``confirm``."""
+    """Unpickle; return the object, and the objects of other hosts in it for ``confirm``."""
     global _taken
     taken: Taken = []
     before, _taken = _taken, taken
@@ -53,8 +53,9 @@ def loads(data: BytesLike, buffers: Iterable[BytesLike]) -> tuple[Any, Taken]:
 
 
 def confirm(taken: Taken) -> None:
-    """Returns once the hubs of those that are still here know that they are: whoever learns of it
-    then may take back what it granted.
+    """Return when the hubs know of those objects that are still used here.
+
+    From then on the process that pickled them may end its grants.
     """
     for reference in taken:
         remote = reference()
@@ -63,43 +64,43 @@ def confirm(taken: Taken) -> None:
 
 
 class RemoteObject:
-    """An object that lives elsewhere, and stays there as long as this is open.
+    """Object of another host.  The hub there keeps it as long as this is open.
 
-    No lock: whatever interrupts a thread here, a finalizer or a signal's handler, may use the same
-    object.  A stream is for whoever has taken it out of the idle ones.  The object holds them all:
-    who is interrupted with one in hand loses the use of that one, and not the last hold on what the
-    hub keeps for us.
+    There is no lock: a finalizer or a signal's handler may interrupt a thread here and use the same
+    object.  A thread owns the stream that it has taken out of the idle ones.  The object keeps a
+    list of all streams.  So a thread that is interrupted with a stream in hand loses only that
+    stream, and the hub still keeps the object.
     """
 
     def __init__(self, home: HubAddress, grant: bytes, identity: bytes = NO_SECRET) -> None:
         self.home = home
         self.identity = identity
         self.token = os.urandom(SECRET_BYTES)
-        """Proves to the hub that it uses the object."""
+        """Secret by which the hub knows that this process uses the object."""
         self._pid = os.getpid()
         self._closed = False
         self._streams: list[HubStream] = []
-        # Opened at once, so that the grant is used up, but without waiting: whoever unpickles this
-        # may be the very thread that carries the answer.  An error shows at the first request.
+        # Opened at once to use the grant, but without waiting: this may be the thread that would
+        # have to carry the reply.  The first request raises an error of the hub.
         self._idle = deque([self._open(grant)])
         if _taken is not None:
             _taken.append(weakref.ref(self))
 
     def confirm(self) -> None:
-        """Returns once its hub knows that it is used, or cannot be asked."""
+        """Return when the hub knows that the object is used here, or cannot be reached."""
         if not any(stream.has_answered for stream in tuple(self._streams)):
             with suppress(OSError, ObjectUnreachable), self.stream() as stream:
                 stream.ask(Op.SYNC, 0, form=ONE)
 
     def known(self) -> bytes:
-        """Return the token, once the hub knows it: other streams may name it."""
+        """Return the token after the hub knows it, so that other streams can use it."""
         self._check()
         self.confirm()
         return self.token
 
     @contextmanager
     def stream(self) -> Iterator[HubStream]:
-        """A stream to the object's hub that nobody else uses."""
+        """Yield a stream to the object's hub that no other thread uses."""
         with self._take(self._idle) as stream:
             late = stream.settle()
             if late is not None:
@@ -107,13 +108,13 @@ class RemoteObject:
             yield stream
 
     def close(self) -> None:
-        """Let go of the object."""
+        """Drop the object."""
         self._closed = True
         _close_all(self._idle)
         self._streams.clear()
 
     def __del__(self) -> None:
-        if hasattr(self, "_idle"):  # otherwise its first stream could not be opened
+        if hasattr(self, "_idle"):  # missing if the first stream could not be opened
             self.close()
 
     def _open(self, grant: bytes = NO_SECRET) -> HubStream:
@@ -122,7 +123,7 @@ class RemoteObject:
         return stream
 
     def _pop(self, idle: deque[HubStream]) -> HubStream:
-        """A stream that nobody else uses, until it is put back."""
+        """Take a stream that no other thread uses.  The caller puts it back."""
         self._check()
         try:
             return idle.pop()
@@ -147,13 +148,13 @@ class RemoteObject:
             self._forked()
 
     def _forked(self) -> None:
-        """Someone else forked us: the streams are our parent's, which keeps the object there."""
+        """Begin without streams in a forked process.  The parent's streams keep the object."""
         self._pid = os.getpid()
         self._idle.clear()
         self._streams.clear()
 
     def _settled(self, operation: Op, reply: Reply) -> None:
-        """A request that was given up (Ctrl-C) had been granted by then."""
+        """Handle the late reply to a request that was given up (Ctrl-C)."""
 
 
 class RemoteChannel(RemoteObject):
@@ -163,14 +164,14 @@ class RemoteChannel(RemoteObject):
 
     def __init__(self, home: HubAddress, grant: bytes, identity: bytes = NO_SECRET) -> None:
         self._late: deque[Reply] = deque()
-        # One; more once threads have asked for a descriptor at the same moment.
+        # One stream; more if threads asked for a descriptor at the same moment.
         self._watching: deque[HubStream] = deque()
         self._unconfirmed: deque[HubStream] = deque()
         super().__init__(home, grant, identity)
 
     def send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
-        """Send one message; returns when it can be received."""
-        if self._unconfirmed:  # on streams of their own: they must not be overtaken
+        """Send one message; return when it can be received."""
+        if self._unconfirmed:  # on other streams, which this message must not overtake
             self.send_unconfirmed(payload, buffers)
             self._confirm()
             return
@@ -180,7 +181,7 @@ class RemoteChannel(RemoteObject):
     def send_unconfirmed(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
         """Send one message and return at once.
 
-        The next one finds out first whether it could be sent, and raises what ``send`` would have.
+        The next call first reads the reply, and raises the error of this message if there was one.
         """
         with _naming_the_end(), self._take(self._unconfirmed) as stream:
             _check_sent(stream.finish())
@@ -191,29 +192,29 @@ class RemoteChannel(RemoteObject):
             _check_sent(stream.finish())
 
     def post(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
-        """The same: a channel of another host takes a message when its hub has it."""
+        """Send one message as ``send`` does, which only waits until the hub has it."""
         self.send(payload, buffers)
 
     def try_send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
-        """Never: to find out takes as long as to send."""
+        """Return False: to find out whether there is room takes as long as to send."""
         return False
 
     def recv(self, *, passing: bool = False) -> Message:
-        """The next message; EOFError at the end."""
+        """Return the next message; ConnectionClosed at the end."""
         message = self._receive(Op.RECV)
         assert message is not None
         return message
 
     def recv_object(self) -> Any:
-        """The next message, unpickled."""
+        """Return the next message, unpickled."""
         return packet.loads(self.recv())
 
     def try_recv(self) -> Message | None:
-        """The next message if one is there; EOFError at the end."""
+        """Return the next message if there is one; ConnectionClosed at the end."""
         return self._receive(Op.TRY_RECV)
 
     def recv_counting(self, counter: RemoteCounter, *, wait: bool) -> Message | None:
-        """Receive a message, for which the hub raises ``counter``; None if there is none."""
+        """Receive a message, and have the hub raise ``counter``; None if there is no message."""
         return self._receive(Op.DRAW if wait else Op.TRY_DRAW, counter.known(), form=SECRET)
 
     def _receive(self, operation: Op, *values: bytes, form: struct.Struct = HEAD) -> Message | None:
@@ -236,10 +237,10 @@ class RemoteChannel(RemoteObject):
             return bool(self._late) or stream.ask(Op.POLL, timeout=timeout).status is Status.OK
 
     def fileno(self) -> int:
-        """A descriptor that is readable if, at this moment, there is something to receive.
+        """Return a descriptor that is readable if there is a message at this moment.
 
-        It becomes so when there is.  It may stay so for too long if another holder receives it:
-        ask again for the truth.
+        It becomes readable when a message comes.  If another holder receives that message, it stays
+        readable until the next call.
         """
         with self._take(self._watching) as watching:
             if watching.ask(Op.CHECK).status is Status.OK:
@@ -247,13 +248,13 @@ class RemoteChannel(RemoteObject):
             return watching.fileno()
 
     def close(self) -> None:
-        """Let go of this end."""
+        """Drop this end."""
         super().close()
         _close_all(self._watching)
         _close_all(self._unconfirmed)
 
     def _watch_again(self) -> None:
-        """The descriptor says that there is something, and there is not."""
+        """Make the descriptors not readable, as there is no message, and watch again."""
         for _ in range(len(self._watching)):
             with self._take(self._watching) as watching:
                 while wait_readable(watching.fileno(), 0):
@@ -272,7 +273,7 @@ class RemoteChannel(RemoteObject):
 
 
 class RemoteEnd(RemoteChannel):
-    """An end of a one-way channel on another host, and what a handle needs to rebuild it there."""
+    """End of a one-way channel on another host, with the data of its handle."""
 
     def __init__(
         self,
@@ -288,10 +289,10 @@ class RemoteEnd(RemoteChannel):
 
 
 class RemoteCounter(RemoteObject):
-    """A counting event on another host; a ``SharedCounter``."""
+    """Counter of another host; a ``SharedCounter``."""
 
     def add(self, n: int = 1) -> None:
-        """Raise the count; returns when it is done."""
+        """Raise the count; return when that is done."""
         with self.stream() as stream:
             stream.ask(Op.ADD, n, form=ONE)
 
@@ -305,7 +306,7 @@ class RemoteCounter(RemoteObject):
             return True
 
     def claim(self, timeout: float | None, taken: list[Any], claims: Claimant) -> bool:
-        """Take one as ``take`` does.  The hub takes it back if this process dies before."""
+        """Take one and record it.  If this process dies in between, the hub undoes it."""
         with self.stream() as stream:
             if stream.ask(Op.CLAIM, timeout=timeout).status is not Status.OK:
                 return False
@@ -315,13 +316,13 @@ class RemoteCounter(RemoteObject):
             return True
 
     def clear(self) -> int:
-        """Set the count to zero and say what it was."""
+        """Set the count to zero and return the count before."""
         with self.stream() as stream:
             count: int = stream.ask(Op.CLEAR).values[0]
         return count
 
     def value(self) -> int:
-        """The count now."""
+        """Return the count."""
         with self.stream() as stream:
             count: int = stream.ask(Op.VALUE).values[0]
         return count
@@ -357,5 +358,5 @@ def _check_sent(reply: Reply | None) -> None:
 
 def _close_all(streams: deque[HubStream]) -> None:
     while streams:
-        with suppress(IndexError):  # someone else has closed the last one
+        with suppress(IndexError):  # another thread has closed the last one
             streams.pop().close()

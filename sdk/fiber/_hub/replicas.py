@@ -1,31 +1,31 @@
-"""Blocks of shared memory that several hosts have, as the hub of one of them sees them.
+"""Blocks of shared memory that several hosts have, at the hub of one of these hosts.
 
-A block has a home, where it was made.  When a process of another host wants it, that host *joins*:
-its hub makes a block of its own, a *replica*, and asks the next hub on the way to the home for the
-contents.  That hub joins first if it is not the home itself.  So the hosts that have a block form a
-tree along the links, and changes travel only there.
+A block has a home, the host where it was made.  When a process of another host uses the block,
+that host *joins*: its hub makes a local block, a *replica*, and requests the contents from the next
+hub on the way to the home.  That hub joins first, unless it is the home.  So the hosts with a block
+form a tree along the links, and changes travel only along this tree.
 
-On a link each block has a number, given by the side that joins.  The messages about a block::
+On a link each block has a number, chosen by the side that joins.  The messages about a block::
 
-    JOIN      an Origin; the other side sends what is not zero, as patches, and READY
-    READY     empty, or why it cannot be had
-    PATCH     what changed
+    JOIN      an Origin; the other side sends the bytes that are not zero, as patches, and READY
+    READY     empty, or the reason why the block is not available
+    PATCH     changes
     ACK       a patch of the side that joined has arrived
-    LEAVE     the side that joined has no use for it any more
+    LEAVE     the side that joined does not use the block from now on
 
-The class ``Replicas`` and its parts run on the loop thread.  The arithmetic below keeps the copies
-in step, without I/O.
+The class ``Replicas`` and its parts run on the loop thread.  ``Twin`` and the functions below it
+compute changes, without I/O.
 
-Each side of a link between two of the hosts has a *twin* of the block: the contents that both sides
-agree on.  Before anything else is sent over the link, the difference from the twin is sent as a
-*patch*, and links keep the order.  So a process that learns of a write through a message finds the
-write in its memory, however many hosts the message passed. That is lazy release consistency
-(Keleher, Cox and Zwaenepoel, 1992), with links for locks.
+Each side of a link between two such hosts has a *twin* of the block: the contents that both sides
+agree on.  Before any other message is sent over the link, the difference from the twin is sent as a
+*patch*, and links keep the order.  So a process that gets a message after a write finds the write
+in its memory, however many hosts the message passed.  That is lazy release consistency (Keleher,
+Cox and Zwaenepoel, 1992), with links in place of locks.
 
-A patch names exactly the bytes that changed.  Where no message orders two writes, writes to
-different bytes merge.  Of two writes to one byte, the one that the home sees last wins, and in the
-end all hosts have it: the side that is farther from the home keeps what it has sent until that is
-acknowledged, and what it has not sent yet.
+A patch names exactly the bytes that changed.  If no message orders two writes, writes to different
+bytes merge.  Of two writes to one byte, the one that the home sees last wins, and finally all hosts
+have it.  For that, the side that is farther from the home keeps its patches until they are
+acknowledged, and its changes that are not sent yet.
 
 A patch is a sequence of extents::
 
@@ -50,10 +50,10 @@ from fiber._wire.descriptor import own
 from fiber._wire.messages import MemoryMessage, ProtocolError
 
 PATCH = 1 << 18
-"""Bytes above which a patch is sent in pieces."""
+"""Bytes from which a patch is sent, and another one begins."""
 
-_SPAN = 1 << 16  # what is compared first
-_CHUNK = 1 << 12  # within such as differ; an extent is part of one
+_SPAN = 1 << 16  # bytes that are compared at once
+_CHUNK = 1 << 12  # bytes that are compared within a span that differs; limit of an extent
 _HEAD = struct.Struct("<QI")
 _CHANGED = bytes([ord("0")]) + bytes([ord("1")]) * 255
 _RUN = re.compile(b"1+")
@@ -62,7 +62,7 @@ Contents = memoryview | bytearray
 
 
 class Run(NamedTuple):
-    """Bytes in a row that changed."""
+    """Consecutive bytes that changed."""
 
     start: int
     data: bytes
@@ -71,7 +71,7 @@ class Run(NamedTuple):
 class Twin:
     """State of one side of a link for a block that both sides share.  Both begin with zeros.
 
-    ``follows``: whether the other side is nearer to the block's home.
+    ``follows`` is True if the other side is nearer to the block's home.
     """
 
     def __init__(self, memory: memoryview, *, follows: bool) -> None:
@@ -81,7 +81,7 @@ class Twin:
         self._unacknowledged: deque[bytes] = deque()
 
     def collect(self) -> Iterator[bytes]:
-        """Yield the patches to send, in order: changes that the other side does not know."""
+        """Yield patches with the changes that the other side does not have, in order."""
         patch = b""
         for extent in _differences(self._agreed, self._memory):
             patch += extent
@@ -97,11 +97,11 @@ class Twin:
         return patch
 
     def acknowledged(self) -> None:
-        """The other side has the first patch of those that it did not have."""
+        """Note that the oldest unacknowledged patch has arrived."""
         self._unacknowledged.popleft()
 
     def merge(self, patch: memoryview) -> None:
-        """Apply what the other side sent; ValueError if that is no patch of this block."""
+        """Apply a patch of the other side; ValueError if it is malformed."""
         runs = list(_runs(patch, len(self._memory)))
         if self._follows:
             self._merge_newer(runs)
@@ -123,14 +123,14 @@ class Twin:
                 self._memory[start:end] = new
                 continue
             for index, (mine, was) in enumerate(zip(here, old, strict=True), start):
-                if mine == was:  # otherwise it was changed here, and is yet to be sent
+                if mine == was:  # otherwise a change here is not sent yet, and stays
                     self._memory[index] = new[index - start]
 
 
 def _differences(old: bytearray, memory: memoryview) -> Iterator[bytes]:
-    """Bring ``old`` up to date with ``memory``; the extents that changed."""
+    """Update ``old`` from ``memory``, and yield the extents that changed."""
     for start in range(0, len(old), _SPAN):
-        # Others may write meanwhile: each byte is looked at once, and what comes later, later.
+        # Processes may write meanwhile.  Each byte is read once; later writes are found next time.
         now = bytes(memory[start : start + _SPAN])
         was = bytes(old[start : start + _SPAN])
         if now == was:
@@ -173,11 +173,11 @@ def _write(memory: bytearray, runs: list[Run] | Iterator[Run]) -> None:
 
 
 BlockIdentity = tuple[str, bytes]
-"""Home of a block, and its secret identity there."""
+"""Home of a block, and its secret name there."""
 SendMemoryMessage = Callable[[MemoryMessage], None]
 
 
-class _Kind(IntEnum):
+class _MemoryKind(IntEnum):
     JOIN = 1
     READY = 2
     PATCH = 3
@@ -185,37 +185,37 @@ class _Kind(IntEnum):
     LEAVE = 5
 
 
-_KINDS = {kind: bytes([kind]) for kind in _Kind}
+_KINDS = {kind: bytes([kind]) for kind in _MemoryKind}
 
 
 class Joiner(Protocol):
-    """Waits for a block to be here."""
+    """Object that waits until a block is here."""
 
     def joined(self, block: Block) -> None:
-        """Take the block, as its home knew it a moment ago."""
+        """Take the block, which has its contents now."""
 
     def refused(self, reason: str) -> None:
-        """Note that the block cannot be had."""
+        """Note that the block is not available."""
 
 
 class Replica:
-    """A block that this host shares with others: its own, or a copy of another's."""
+    """Block that this host shares with other hosts: made here, or a copy."""
 
     def __init__(self, origin: Origin, block: Block) -> None:
         self.identity = origin.block
         self.block = block
         self.memory = block.view
         self.joiners: list[Joiner] = []
-        """Joiners that wait for the contents."""
+        """Objects that wait for the contents."""
         self.users: set[object] = set()
-        """Processes of this host, and links whose other side has joined here."""
+        """Streams of processes of this host, and links whose other side has joined here."""
         self.upstream: _Share | None = None
-        """Towards the home; None at the home, and once that cannot be reached any more."""
+        """Share on the link towards the home; None at the home, and after that link has ended."""
         self.ready = True
 
 
 class _Share:
-    """A block on one link."""
+    """Block on one link."""
 
     def __init__(self, link: MemoryLink, number: int, replica: Replica, *, follows: bool) -> None:
         self.link = link
@@ -235,20 +235,20 @@ class Replicas:
         self._links: dict[str | None, MemoryLink] = {}
 
     def link(self, host: str | None, send: SendMemoryMessage, *, dialer: bool) -> MemoryLink:
-        """A new link, as the router's."""
+        """Add a link, as ``Router.link`` does."""
         link = self._links[host] = MemoryLink(self, send, dialer=dialer)
         return link
 
     def unlink(self, host: str | None, reason: str) -> None:
-        """The link is over."""
+        """Remove a link that has ended."""
         link = self._links.pop(host, None)
         if link is not None:
             link.lost(reason)
 
     def join(self, origin: Origin, user: object, joiner: Joiner) -> None:
-        """Have the block here for ``user``, until that leaves; tell ``joiner``.
+        """Get the block here for ``user``, until ``user`` leaves; then call ``joiner``.
 
-        Elsewhere than at its home, only the users of a block know the identity of a replica.
+        Away from its home no grant is checked: only users of the block know its secret name.
         """
         try:
             own = self._own_block(origin) if origin.home == self._host else None
@@ -274,11 +274,11 @@ class Replicas:
                 replica.upstream.link.leave(replica.upstream)
 
     def at(self, identity: BlockIdentity) -> Replica:
-        """A block that is here."""
+        """Return a block that is here."""
         return self._replicas[identity]
 
     def arrived(self, replica: Replica, problem: str) -> None:
-        """The contents are there, or there is a ``problem``."""
+        """Note that the contents have arrived, or a ``problem`` in place of them."""
         replica.ready = not problem
         joiners, replica.joiners = replica.joiners, []
         if problem:
@@ -303,8 +303,8 @@ class Replicas:
 
     def _own_block(self, origin: Origin) -> Block:
         shared = self._registry.look_up(origin.token, origin.grant)
-        told = ObjectKind.MEMORY, origin.identity, origin.size
-        if told != (shared.kind, shared.identity, shared.extent.size):
+        expected = ObjectKind.MEMORY, origin.identity, origin.size
+        if expected != (shared.kind, shared.identity, shared.extent.size):
             raise NoSuchObject("there is no such block of shared memory")
         (segment,) = map(own, shared.duplicates())
         return block_of(segment, *shared.extent)
@@ -317,7 +317,7 @@ class Replicas:
 
 
 class MemoryLink:
-    """The blocks that both sides of one link have."""
+    """Blocks that both sides of one link have."""
 
     def __init__(self, home: Replicas, send: SendMemoryMessage, *, dialer: bool) -> None:
         self._home = home
@@ -327,7 +327,7 @@ class MemoryLink:
         self._joining: dict[int, _Downstream] = {}
 
     def __bool__(self) -> bool:
-        """True if there are shares."""
+        """Tell whether both sides have a block."""
         return bool(self._shares)
 
     def flush(self) -> None:
@@ -338,37 +338,37 @@ class MemoryLink:
     def _flush(self, share: _Share) -> None:
         if share.replica.ready:
             for patch in share.twin.collect():
-                self._say(share.number, _Kind.PATCH, patch)
+                self._say(share.number, _MemoryKind.PATCH, patch)
 
-    def _say(self, number: int, kind: _Kind, data: bytes = b"") -> None:
+    def _say(self, number: int, kind: _MemoryKind, data: bytes = b"") -> None:
         self._send(MemoryMessage(number, _KINDS[kind] + data))
 
     def on_frame(self, frame: MemoryMessage) -> None:
-        """Take a frame of the other side; ProtocolError if it is wrong."""
+        """Take a message of the other side; ProtocolError if it is malformed."""
         payload = memoryview(frame.payload)
         try:
-            kind = _Kind(payload[0])
-            if kind is _Kind.JOIN:
+            kind = _MemoryKind(payload[0])
+            if kind is _MemoryKind.JOIN:
                 self._accept(frame.block, Origin.decode(payload[1:]))
             else:
-                self._heard(frame.block, kind, payload[1:])
+                self._receive(frame.block, kind, payload[1:])
         except (struct.error, ValueError, IndexError) as error:
             raise ProtocolError(f"malformed data about shared memory: {error}") from error
 
     # The side that joins
 
     def join(self, replica: Replica, origin: Origin) -> _Share:
-        """Ask the other side for a block."""
+        """Request a block from the other side."""
         share = _Share(self, next(self._numbers), replica, follows=True)
         self._shares[share.number] = share
-        self._say(share.number, _Kind.JOIN, origin.encode())
+        self._say(share.number, _MemoryKind.JOIN, origin.encode())
         return share
 
     def leave(self, share: _Share) -> None:
         """Leave a block that no process of this host uses."""
         if self._shares.pop(share.number, None) is not None:
             self._flush(share)
-            self._say(share.number, _Kind.LEAVE)
+            self._say(share.number, _MemoryKind.LEAVE)
 
     # The other side
 
@@ -377,22 +377,22 @@ class MemoryLink:
         self._home.join(origin, downstream, downstream)
 
     def accepted(self, downstream: _Downstream) -> None:
-        """The contents for the other side are here."""
+        """Send the contents, which are here now, to the other side."""
         number = downstream.number
         if number not in self._joining:
-            return  # it left while it waited
+            return  # the other side left while it waited
         replica = self._home.at(downstream.identity)
         share = self._shares[number] = _Share(self, number, replica, follows=False)
         self._flush(share)
-        self._say(number, _Kind.READY)
+        self._say(number, _MemoryKind.READY)
 
     def refused(self, downstream: _Downstream, reason: str) -> None:
-        """Refuse the contents to a host that joins."""
+        """Tell the other side why it cannot have the contents."""
         if self._joining.pop(downstream.number, None) is not None:
-            self._say(downstream.number, _Kind.READY, reason.encode(errors="replace"))
+            self._say(downstream.number, _MemoryKind.READY, reason.encode(errors="replace"))
 
-    def _heard(self, number: int, kind: _Kind, data: memoryview) -> None:
-        if kind is _Kind.LEAVE:
+    def _receive(self, number: int, kind: _MemoryKind, data: memoryview) -> None:
+        if kind is _MemoryKind.LEAVE:
             self._shares.pop(number, None)
             downstream = self._joining.pop(number, None)
             if downstream is not None:
@@ -400,12 +400,12 @@ class MemoryLink:
             return
         share = self._shares.get(number)
         if share is None:
-            return  # it was left while this was under way
-        if kind is _Kind.PATCH:
+            return  # this side left while the message was on its way
+        if kind is _MemoryKind.PATCH:
             share.twin.merge(data)
             if not share.follows:
-                self._say(number, _Kind.ACK)
-        elif kind is _Kind.ACK:
+                self._say(number, _MemoryKind.ACK)
+        elif kind is _MemoryKind.ACK:
             share.twin.acknowledged()
         else:
             problem = str(data, "utf-8", "replace")
@@ -414,7 +414,7 @@ class MemoryLink:
             self._home.arrived(share.replica, problem)
 
     def lost(self, reason: str) -> None:
-        """The link is over: what is here stays as it is."""
+        """Note that the link has ended.  Blocks here keep their contents."""
         shares, self._shares = self._shares, {}
         joining, self._joining = self._joining, {}
         for share in shares.values():
@@ -427,7 +427,7 @@ class MemoryLink:
 
 
 class _Downstream:
-    """The other side of a link, which has joined here or waits for that; a ``Joiner``."""
+    """Other side of a link that has joined here, or waits for that; a ``Joiner``."""
 
     def __init__(self, link: MemoryLink, number: int, identity: BlockIdentity) -> None:
         self.number = number
@@ -439,5 +439,5 @@ class _Downstream:
         self._link.accepted(self)
 
     def refused(self, reason: str) -> None:
-        """Say why not."""
+        """Send the reason to the other side."""
         self._link.refused(self, reason)

@@ -39,7 +39,7 @@ from fiber._wire.descriptor import own
 
 
 class SharedBuffer:
-    """Some bytes of shared memory, zero at first."""
+    """Bytes of shared memory, zero at first."""
 
     __slots__ = ("__weakref__", "_block")
 
@@ -48,7 +48,7 @@ class SharedBuffer:
 
     @property
     def view(self) -> memoryview:
-        """The bytes; to be used while this object is kept."""
+        """View of the bytes.  Keep this object while you use it."""
         return self._block.view
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -56,15 +56,15 @@ class SharedBuffer:
 
 
 class ReplicaBuffer(SharedBuffer):
-    """The same on another host than where it was made."""
+    """Shared memory of another host, with a replica on this host."""
 
     __slots__ = ("_extent", "_original", "_stream")
 
     def __init__(self, home: HubHandle, extent: Extent) -> None:
         self._extent = extent
-        # Keeps the original at its home.
+        # Keeps the original block at its home.
         original = self._original = RemoteObject(*home)
-        # Keeps the replica at this host's hub, until this object is forgotten.
+        # Keeps the replica at this host's hub as long as this object exists.
         self._stream = HubStream(client.hub_address())
         address, grant, identity = home
         origin = Origin(address.host, identity, extent.size, original.token, grant)
@@ -77,7 +77,7 @@ class ReplicaBuffer(SharedBuffer):
 
 
 def create_buffer(size: int) -> SharedBuffer:
-    """A new one."""
+    """Return a new buffer of ``size`` bytes."""
     return SharedBuffer(heap.allocate(size))
 
 
@@ -104,7 +104,7 @@ class RemoteSemaphore(RemoteObject):
         super().__init__(*handle)
 
     def acquire(self, block: bool = True, timeout: float | None = None) -> bool | Abandoned:
-        """Take a token; False if there is none, nor within ``timeout`` seconds."""
+        """Take a token; False if there is none within ``timeout`` seconds."""
         if self.kind == RECURSIVE and self._is_mine():
             self._depth += 1
             return True
@@ -130,7 +130,7 @@ class RemoteSemaphore(RemoteObject):
         return Abandoned(str(reply.parts[0], "utf-8", "replace")) if reply.parts else True
 
     def release(self) -> None:
-        """Give a token back; ValueError if there are as many as there can be.
+        """Return a token; ValueError if the semaphore is at its maximum.
 
         AssertionError if it is recursive and this thread has not acquired it.
         """
@@ -152,7 +152,7 @@ class RemoteSemaphore(RemoteObject):
             self._idle.append(stream)
 
     def _is_mine(self) -> bool:
-        """Tell whether this thread was the last of this process to acquire it, and holds it."""
+        """Tell whether this thread holds it, and was the last of this process to acquire it."""
         return self._depth > 0 and self._owner == threading.get_ident()
 
     def _count(self) -> int:
@@ -160,7 +160,7 @@ class RemoteSemaphore(RemoteObject):
         return self._depth
 
     def _get_value(self) -> int:
-        """Return how often it can be acquired now."""
+        """Return the number of tokens that are available."""
         with self.stream() as stream:
             value: int = stream.ask(Op.TOKENS).values[0]
         return value
@@ -170,12 +170,12 @@ class RemoteSemaphore(RemoteObject):
         return not self._get_value()
 
     def close(self) -> None:
-        """Let go of it, and of what this process has of it."""
+        """Drop the semaphore, and the tokens that this process holds."""
         super().close()
         self._holding.clear()
 
     def _give(self, stream: HubStream) -> None:
-        self._depth -= 1  # before another thread can have it
+        self._depth -= 1  # before another thread can acquire it
         if stream.ask(Op.POST).status is Status.NO:
             self._depth += 1
             raise ValueError("semaphore or lock released too many times")
@@ -191,15 +191,15 @@ class RemoteSemaphore(RemoteObject):
 
 AnySemaphore: TypeAlias = SharedSemaphore | RemoteSemaphore
 
-# One object for each in a process: only so a recursive one knows its thread again, however often it
-# was unpickled.  By the identity of its block, or by the one that its hub elsewhere gave it.
+# A process has one object for each semaphore, so that a recursive one knows its holder, however
+# often it was unpickled.  The key is the identity of its block, or the identity from its hub.
 _semaphores: weakref.WeakValueDictionary[tuple[object, ...], AnySemaphore] = (
     weakref.WeakValueDictionary()
 )
 
 
 def create_semaphore(kind: int, value: int, maximum: int) -> SharedSemaphore:
-    """A new one, with ``value`` of at most ``maximum`` tokens."""
+    """Return a new semaphore with ``value`` of at most ``maximum`` tokens."""
     block = heap.allocate(SEMAPHORE_SIZE)
     new = _semaphores[block.identity] = SharedSemaphore.create(block, kind, value, maximum, ring)
     return new
@@ -236,14 +236,14 @@ copyreg.pickle(RemoteSemaphore, _reduce_remote_semaphore)
 
 
 class RemoteWaitList(RemoteObject):
-    """Wait list of another host.  A place is a stream, so it ends with this process."""
+    """Wait list of another host.  A stream keeps each place, which ends with this process."""
 
     def __init__(self, handle: HubHandle, extent: Extent) -> None:
         self.extent = extent
         super().__init__(*handle)
 
     def enter(self) -> HubStream:
-        """A place for this thread."""
+        """Take a place for this thread."""
         stream = self._pop(self._idle)
         try:
             stream.settle()
@@ -256,7 +256,7 @@ class RemoteWaitList(RemoteObject):
         return stream
 
     def sleep(self, place: HubStream, timeout: float | None) -> None:
-        """Wait until that place is notified, for ``timeout`` seconds at most.  Without the lock."""
+        """Wait without the lock until ``place`` is notified, at most ``timeout`` seconds."""
         place.ask(Op.SLEEP, timeout=timeout)
 
     def leave(self, place: HubStream) -> bool:
@@ -267,13 +267,13 @@ class RemoteWaitList(RemoteObject):
         return notified
 
     def dismiss(self, place: HubStream) -> None:
-        """Free a place that was taken for longer.  Waits for nothing, and needs no hub."""
+        """Free a place that was kept over several waits.  Never waits; the hub may have ended."""
         with suppress(OSError, ObjectUnreachable):
             place.say(Op.LEAVE)
         place.close()
 
     def notify(self, n: int) -> None:
-        """Wake the ``n`` that have waited for longest; who died meanwhile is passed over."""
+        """Wake the ``n`` threads that have waited longest.  Skip dead ones."""
         self._ask(Op.NOTIFY, n)
 
     def waiters(self) -> int:
@@ -281,23 +281,23 @@ class RemoteWaitList(RemoteObject):
         return self._ask(Op.WAITERS, 0)
 
     def bury(self) -> int:
-        """Return how many waiters died since the last call."""
+        """Free the places of dead waiters; return their number."""
         return self._ask(Op.BURY, 0)
 
     def hold(self, place: HubStream, number: int) -> None:
-        """Note how many things the owner of a place has.  Waits for nothing."""
+        """Note how many things the process at ``place`` has.  Never waits."""
         place.say(Op.HOLD, number, form=ONE)
 
     def tally(self, place: HubStream, held: int, total: int) -> None:
-        """Note how many things the owner of a place has, and set the user's second word."""
+        """Note how many things the process at ``place`` has, and set the user's second word."""
         place.ask(Op.TALLY, held, total, form=TWO)
 
     def held(self) -> int:
-        """Return the number of things that all owners of places have."""
+        """Return the number of things that the processes of all places have."""
         return self._ask(Op.HELD, 0)
 
     def reclaim(self, counter: RemoteCounter) -> int:
-        """Free the places of dead processes; give ``counter`` what they had and return it."""
+        """Free the places of dead processes, add their things to ``counter``, and count these."""
         with self.stream() as stream:
             value: int = stream.ask(Op.RECLAIM, counter.known(), form=SECRET).values[0]
         return value
@@ -308,7 +308,7 @@ class RemoteWaitList(RemoteObject):
         return value - (1 << 64) if value >> 63 else value
 
     def set(self, number: int, value: int) -> None:
-        """Set it."""
+        """Set one of the user's two words."""
         with self.stream() as stream:
             stream.ask(Op.SET, number, value & ((1 << 64) - 1), form=TWO)
 
@@ -322,7 +322,7 @@ AnyWaitList: TypeAlias = WaitList | RemoteWaitList
 
 
 def create_wait_list() -> WaitList:
-    """A new one, with nobody in it."""
+    """Return a new, empty wait list."""
     return WaitList(heap.allocate(WAIT_LIST_SIZE), ring)
 
 

@@ -34,34 +34,34 @@ from fiber._wire.messages import TunnelClose, TunnelData, TunnelOpen
 from fiber._wire.packet import Message
 
 CONGESTED = 1 << 20
-"""Bytes waiting to be sent above which a stream asks for patience."""
+"""Bytes that wait to be sent above which a stream is congested."""
 
 _AT_ONCE = 16
-"""Messages of one stream before the others get their turn."""
+"""Limit of messages of one stream in a turn.  Then other streams get their turn."""
 
 
 class StreamHandler(Protocol):
-    """Hears what comes on a stream."""
+    """Receiver of the messages of a stream."""
 
     def on_message(self, message: Message) -> None:
-        """A message; borrowed until this returns."""
+        """Take a message, which must not be used after the return."""
 
     def on_room(self) -> None:
         """Note that a congested stream has room again."""
 
     def on_closed(self, reason: str) -> None:
-        """Note the end.  Called once, and last; ``reason`` is empty at an orderly end."""
+        """Note the end.  Called once, as the last call; ``reason`` is empty at an orderly end."""
 
 
 class Stream(Protocol):
-    """End of a stream."""
+    """End of a stream between a hub and a client."""
 
     handler: StreamHandler
     passes_descriptors: bool
 
     @property
     def congested(self) -> bool:
-        """True if messages pile up.  Sending more still works."""
+        """True if many messages wait to be sent.  ``send`` still works."""
 
     def send(
         self,
@@ -69,33 +69,36 @@ class Stream(Protocol):
         buffers: Sequence[memoryview] = (),
         fds: Sequence[int] = (),
     ) -> None:
-        """Send now or as soon as there is room.  After the end it does nothing.  Takes ``fds``."""
+        """Send now or as soon as there is room; do nothing after the end.  Takes over ``fds``."""
 
     def pause(self) -> None:
-        """Let nothing come until ``resume``."""
+        """Deliver no message until ``resume``."""
 
     def resume(self) -> None:
-        """Go on."""
+        """Deliver messages again."""
 
     def finish(self, reason: str = "") -> None:
-        """End it, once what was sent has left, and say why.  The handler hears nothing more."""
+        """End the stream after the messages that were sent, with a reason.
+
+        The handler is not called again.
+        """
 
 
 class NullHandler:
-    """The handler of a stream that nobody listens to any more."""
+    """Handler that ignores the messages of a stream."""
 
     def on_message(self, message: Message) -> None:
-        """Ignore it."""
+        """Do nothing."""
 
     def on_room(self) -> None:
-        """Ignore it."""
+        """Do nothing."""
 
     def on_closed(self, reason: str) -> None:
-        """Ignore it."""
+        """Do nothing."""
 
 
 class SocketStream:
-    """A stream over a unix socket."""
+    """Stream over a unix socket."""
 
     passes_descriptors = True
 
@@ -112,7 +115,7 @@ class SocketStream:
 
     @property
     def congested(self) -> bool:
-        """True if messages pile up."""
+        """True if many messages wait to be sent."""
         return self._waiting_bytes > CONGESTED
 
     def send(
@@ -125,23 +128,23 @@ class SocketStream:
         if self._sock.fileno() < 0 or self._finishing:
             _close_all(fds)
         elif self._waiting or not self._try(payload, buffers, fds):
-            # The payload may be borrowed; buffers are their message's own.
+            # The payload may be in borrowed memory; the buffers belong to the message.
             self._waiting.append((bytes(payload), buffers, fds))
             self._waiting_bytes += _size(payload, buffers)
             self._watch()
 
     def pause(self) -> None:
-        """Read nothing."""
+        """Stop reading."""
         self._paused = True
         self._watch()
 
     def resume(self) -> None:
-        """Read on."""
+        """Read again."""
         self._paused = False
         self._watch()
 
     def finish(self, reason: str = "") -> None:
-        """End it once all is sent."""
+        """End the stream when all messages are sent."""
         self.handler = NullHandler()
         if reason:
             self.send(protocol.gone(reason))
@@ -163,7 +166,7 @@ class SocketStream:
             self._flush()
         if events & ~OUT and self._sock.fileno() >= 0:
             if self._paused or self._finishing:
-                # Only its end is reported then.  Whoever is gone waits for no answer.
+                # The poller reports only the end now.  The client has ended and waits for no reply.
                 self._close("")
             else:
                 self._read()
@@ -178,7 +181,7 @@ class SocketStream:
                 self._close("")
                 return
             except (OSError, MemoryError, struct.error, ValueError, IndexError) as error:
-                # No descriptor or memory free for what it sent, or no packet of ours.
+                # No descriptor or memory is free for the message, or the packet is malformed.
                 handler = self.handler
                 self.finish(str(error))
                 handler.on_closed(str(error))
@@ -197,7 +200,7 @@ class SocketStream:
         except BlockingIOError:
             return False
         except BrokenPipeError:
-            # The reading side will say so, after what it still has for us.
+            # The reader of this socket reports the end, after the last messages.
             pass
         except BaseException:
             _close_all(fds)
@@ -233,29 +236,29 @@ class SocketStream:
 
 
 class _Forwarder:
-    """Passes on what comes from one stream to another, no faster than that one takes it."""
+    """Handler that forwards messages of one stream to another, as fast as that takes them."""
 
     def __init__(self, source: Stream, sink: Stream) -> None:
         self._source = source
         self._sink = sink
 
     def on_message(self, message: Message) -> None:
-        """Pass it on."""
+        """Forward a message."""
         self._sink.send(message.payload, message.buffers)
         if self._sink.congested:
             self._source.pause()
 
     def on_room(self) -> None:
-        """Our source takes messages again: the other direction may go on."""
+        """Resume the other direction, as this stream has room again."""
         self._sink.resume()
 
     def on_closed(self, reason: str) -> None:
-        """Pass the end on."""
+        """Forward the end."""
         self._sink.finish(reason)
 
 
 def splice(one: Stream, other: Stream) -> None:
-    """Make one stream of two."""
+    """Connect two streams: forward the messages of each to the other."""
     one.handler, other.handler = _Forwarder(one, other), _Forwarder(other, one)
 
 
@@ -272,7 +275,7 @@ IN, OUT, EDGE = select.EPOLLIN, select.EPOLLOUT, select.EPOLLET
 
 
 class Poller:
-    """Calls back on the loop's thread with what is ready, for masks that change all the time."""
+    """Watcher of the hub's descriptors, whose masks change often.  Runs on the loop's thread."""
 
     def __init__(self, loop: Loop) -> None:
         self._loop = loop
@@ -281,7 +284,10 @@ class Poller:
         loop.register(self._epoll.fileno(), self._ready)
 
     def watch(self, fd: int, mask: int, callback: Callable[[int], None]) -> None:
-        """Call back when ``fd`` is ready as ``mask`` says, or at its end; 0 forgets it."""
+        """Call back with the events when ``fd`` is ready as in ``mask``, or at its end.
+
+        A mask of 0 forgets ``fd``.
+        """
         before, _ = self._watched.get(fd, (0, None))
         if not mask:
             if self._watched.pop(fd, None) is not None:
@@ -294,12 +300,12 @@ class Poller:
             self._epoll.modify(fd, mask)
 
     def forget(self, fd: int) -> None:
-        """Watch it no more; do it before it is closed."""
+        """Forget ``fd``.  Call it before the descriptor is closed."""
         if self._watched.pop(fd, None) is not None:
             self._epoll.unregister(fd)
 
     def close(self) -> None:
-        """Watch nothing more."""
+        """Forget all descriptors."""
         self._loop.unregister(self._epoll.fileno())
         self._epoll.close()
         self._watched.clear()
@@ -307,14 +313,14 @@ class Poller:
     def _ready(self) -> None:
         for fd, events in self._epoll.poll(0):
             watched = self._watched.get(fd)
-            if watched is not None:  # otherwise forgotten by an earlier one of these events
+            if watched is not None:  # otherwise an earlier event has forgotten it
                 watched[1](events)
 
 
 # Tunnels
 
 WINDOW = 1 << 21
-"""Bytes that one tunnel may have under way before another message."""
+"""Bytes that a tunnel may have on the way before another message."""
 
 _MESSAGE, _CREDIT = range(2)
 _KINDS = [bytes([kind]) for kind in range(2)]
@@ -325,7 +331,7 @@ SendTunnelFrame = Callable[[TunnelFrame], None]
 
 
 class TunnelStream:
-    """End of a tunnel.  Runs on the loop's thread."""
+    """End of a tunnel, as a ``Stream``.  Runs on the loop's thread."""
 
     passes_descriptors = False
 
@@ -344,7 +350,7 @@ class TunnelStream:
 
     @property
     def congested(self) -> bool:
-        """True if the other side takes less than is sent."""
+        """True if there is no credit left."""
         return self._credit <= 0
 
     def send(
@@ -353,7 +359,7 @@ class TunnelStream:
         buffers: Sequence[memoryview] = (),
         fds: Sequence[int] = (),
     ) -> None:
-        """Send now or when there is credit."""
+        """Send now or as soon as there is credit."""
         assert not fds, "a descriptor cannot leave its host"
         if self._closed or self._finishing is not None:
             return
@@ -367,18 +373,18 @@ class TunnelStream:
             self._send_frame(frame)
 
     def pause(self) -> None:
-        """Give no more credit, and keep what still comes."""
+        """Give no more credit, and keep the messages that still come."""
         self._paused = True
 
     def resume(self) -> None:
-        """Go on."""
+        """Deliver messages again."""
         self._paused = False
         while self._early and not self._paused:
             self.handler.on_message(self._early.popleft())
         self._give_credit()
 
     def finish(self, reason: str = "") -> None:
-        """End it once all is sent."""
+        """End the stream when all messages are sent."""
         self.handler = NullHandler()
         if self._closed or self._finishing is not None:
             return
@@ -386,10 +392,10 @@ class TunnelStream:
         if not self._waiting:
             self._end()
 
-    # What comes over the link
+    # Frames from the link
 
     def on_data(self, header: memoryview, buffers: list[memoryview]) -> None:
-        """A frame of this tunnel."""
+        """Take a frame of this tunnel."""
         kind = header[0]
         if kind == _CREDIT:
             was_congested = self.congested
@@ -406,13 +412,13 @@ class TunnelStream:
         self._owe(_size(header, buffers))
 
     def on_close(self, reason: str) -> None:
-        """The other side ended it, or the link is lost."""
+        """Note that the other side ended the tunnel, or that the link is lost."""
         if not self._closed:
             self._closed = True
             self._waiting.clear()
             self._forget(self._number)
             handler, self.handler = self.handler, NullHandler()
-            while self._early:  # sent before the end
+            while self._early:  # they were sent before the end
                 handler.on_message(self._early.popleft())
             handler.on_closed(reason)
 
@@ -446,11 +452,11 @@ class TunnelStream:
 
 
 class Tunnels:
-    """The tunnels of one link.
+    """Tunnels of one link.
 
-    ``send`` takes a frame for the link and does not block.  Whoever has the link calls ``on_frame``
-    with each tunnel frame that comes and ``lost`` at its end, on the loop's thread.  Exactly one
-    side of a link is its ``dialer``: both open tunnels, and their numbers must not meet.
+    ``send`` takes a frame for the link and does not block.  The hub calls ``on_frame`` with each
+    tunnel frame that comes, and ``lost`` at the end of the link, on the loop's thread.  Exactly one
+    side of a link is its ``dialer``: both sides open tunnels, and their numbers must differ.
     """
 
     def __init__(
@@ -467,32 +473,32 @@ class Tunnels:
         self._lost: str | None = None
 
     def open(self, host: str) -> TunnelStream:
-        """A tunnel to the hub of ``host``, to be used at once."""
+        """Open a tunnel to the hub of ``host``.  It can be used at once."""
         stream = self._new(next(self._numbers))
         self._send(TunnelOpen(stream._number, host))
         return stream
 
     def on_frame(self, frame: messages.LinkMessage) -> None:
-        """A frame that came over the link."""
+        """Take a frame from the link."""
         if isinstance(frame, TunnelOpen):
             self._arrived(frame.target, self._new(frame.tunnel))
             return
         assert isinstance(frame, TunnelData | TunnelClose)
         stream = self._streams.get(frame.tunnel)
         if stream is None:
-            return  # it ended here while the frame was under way
+            return  # this side ended it while the frame was on its way
         if isinstance(frame, TunnelClose):
             stream.on_close(frame.reason)
             return
         try:
             stream.on_data(memoryview(frame.payload), [memoryview(b) for b in frame.buffers])
         except (struct.error, ValueError, IndexError, OverflowError, MemoryError) as error:
-            # Not what the other side's tunnel writes.
+            # No tunnel writes such a frame.
             self._send(TunnelClose(frame.tunnel, "malformed data in a tunnel"))
             stream.on_close(f"malformed data in a tunnel: {error}")
 
     def lost(self, reason: str) -> None:
-        """The link is over, and all its tunnels with it."""
+        """Note that the link has ended, and all its tunnels with it."""
         self._lost = reason
         for stream in list(self._streams.values()):
             stream.on_close(reason)
@@ -511,7 +517,7 @@ class Tunnels:
 
 
 class Router:
-    """Knows over which link each host is reached."""
+    """Routes of one hub: the link to each other host."""
 
     def __init__(self, host: str, accept: Callable[[Stream], None]) -> None:
         self._host = host
@@ -519,19 +525,19 @@ class Router:
         self._links: dict[str | None, Tunnels] = {}
 
     def link(self, host: str | None, send: SendTunnelFrame, *, dialer: bool) -> Tunnels:
-        """A new link to ``host``; with None it leads to every host that no other link leads to."""
+        """Add a link to ``host``.  None stands for every host without another link."""
         tunnels = Tunnels(send, dialer=dialer, arrived=self.connect)
         self._links[host] = tunnels
         return tunnels
 
     def unlink(self, host: str | None, reason: str) -> None:
-        """The link is over."""
+        """Remove a link that has ended."""
         tunnels = self._links.pop(host, None)
         if tunnels is not None:
             tunnels.lost(reason)
 
     def connect(self, host: str, stream: Stream) -> None:
-        """Lead ``stream`` to the hub of ``host``."""
+        """Connect ``stream`` to the hub of ``host``."""
         if host == self._host:
             self._accept(stream)
             return

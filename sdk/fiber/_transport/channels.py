@@ -163,7 +163,7 @@ class naming_the_limit:
 
 
 def socketpair(doing: str) -> tuple[socket.socket, socket.socket]:
-    """Two connected packet sockets that block, whatever the program's default timeout is."""
+    """Return two connected packet sockets that block, without the program's default timeout."""
     with naming_the_limit(doing):
         pair = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     for sock in pair:
