@@ -384,7 +384,7 @@ class Controller:
             result = await self._reconcile(key)
             outcome = "gone" if result.forget else "incomplete" if result.failed else "ok"
         except NotLeader:
-            # Whoever acts now looks at every pool when it begins.
+            # The process that acts now looks at every pool when it begins.
             outcome, result = "not_leader", Result()
         except ApiError as error:
             outcome = type(error).__name__.lower()

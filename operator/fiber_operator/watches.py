@@ -164,7 +164,7 @@ def tracing(answered: Answered) -> aiohttp.TraceConfig:
             answered(what, None)
             return
         try:
-            # It is kept, so that whoever asked reads it too.
+            # It is kept, so that the caller reads it too.
             document_of(response.status, response.headers, await response.read(), what)
         except ApiError as error:
             answered(what, error)
@@ -327,7 +327,7 @@ async def watch(
 async def _run_kopf(
     handlers: kopf.OperatorRegistry, namespaces: Collection[str], stop: asyncio.Event
 ) -> None:
-    """Run kopf until it ends for whatever reason, and end what it leaves behind.
+    """Run kopf until it ends for any reason, and end what it leaves behind.
 
     kopf can lose a cancellation: one that comes while a watch ends by itself.  It then waits for
     that watch for ever, so it is given some time from when it begins to end.
@@ -357,7 +357,7 @@ async def _run_kopf(
     finally:
         await _end_tasks(asyncio.all_tasks() - before)
     if not stop.is_set():
-        # kopf has logged it. Whatever it is, pools must be watched: try again.
+        # kopf has logged it. Pools must be watched in any case: try again.
         error = None if operator.cancelled() else operator.exception()
         log.warning("watching ended (%r); it begins anew", error)
 

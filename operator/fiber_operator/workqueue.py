@@ -76,7 +76,7 @@ class Result:
     requeue_after: float | None = None
     """Reconcile again after this many seconds though nothing happens."""
     rest: float = 0.0
-    """Do not reconcile again for this many seconds whatever happens."""
+    """Do not reconcile again for this many seconds in any case."""
     lull: bool = False
     """Reconcile again, even before it has rested, when events of its pods have come and cease."""
     failed: bool = False

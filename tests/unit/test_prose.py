@@ -21,7 +21,7 @@ BADLY = re.compile(
 )
 
 VAGUE = re.compile(r"\b(whoever|whatever)\b", re.IGNORECASE)
-MOST_VAGUE = 100
+MOST_VAGUE = 40
 MOST_WORDS_OF_A_CELL = 40
 CELL_BORDER = re.compile(r"(?<!\\)\|")
 NAMED_CLASS = re.compile(r"\b[A-Z][a-z]+(?:[A-Z][a-z]+)+\b")

@@ -172,7 +172,7 @@ def mark_cut_off(pods: Sequence[PodView], cut_off: CutOff, *, attached: bool) ->
 
 
 def _names_its_own_address(pool: FiberPool) -> bool:
-    """The template says where to dial, whatever the Service's address is."""
+    """The template says where to dial, and not the Service's address."""
     return any(
         variable.get("name") == names.ENV_ADDRESS
         for container in items(mapping(pool.spec.template, "spec").get("containers"))
@@ -202,7 +202,7 @@ class Assessment:
         self.pool, self.spec = pool, pool.spec
         self.knowledge, self.now = knowledge, now
         self.template_hash = manifests.template_hash(pool)
-        # Whoever has taken that label away has said nothing against the pod.
+        # A missing label says nothing against the pod.
         pods = [
             p if p.template_hash else replace(p, template_hash=self.template_hash) for p in pods
         ]

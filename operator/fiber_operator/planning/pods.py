@@ -15,7 +15,7 @@ from fiber_api import names
 from fiber_operator.planning.documents import items, mapping, seconds, text, whole
 
 BRIEF = 10.0
-"""Seconds.  A worker that ends sooner never did its job, whatever its exit code."""
+"""Seconds.  A worker that ends sooner never did its job, with any exit code."""
 
 PROBE_PROGRAM = f"{names.CREDENTIALS_DIRECTORY}/{names.PROBE_PROGRAM}"
 """Command by which a worker's startup probe is recognized as the operator's."""

@@ -80,7 +80,7 @@ def select(layout: Layout, *, bounded: bool = True) -> Selection:
                 raise too_large(layout, found, f"more than {MOST_FILES:,} files")
     if bounded:
         _check_size(layout, found)
-    if layout.paths.directory:  # whatever of it is sent, somebody will work in it
+    if layout.paths.directory:  # children work in it, even if none of it is sent
         found.setdefault(layout.paths.directory, FileEntry("", stat.S_IFDIR))
     sent = {entry.path for entry in found.values()}
     return Selection(found, tuple(left for left in walk.left_out if left.path not in sent))

@@ -61,7 +61,7 @@ class Layout(NamedTuple):
     program: str
     """The program's folder; of some only a part is sent."""
     files: tuple[str, ...]
-    """Files that were imported from the places.  Children need them, whatever ignore files say."""
+    """Files that were imported from the places.  Children need them, even ignored ones."""
     trees: tuple[str, ...]
     """Folders of ``sys.path`` of which only these files are sent."""
     session: frozenset[str]

@@ -479,7 +479,7 @@ def _batch_space(observations: Sequence[Space[Any]], mode: ObservationMode) -> S
     if isinstance(mode, tuple):
         return mode[0]
     first = observations[0]
-    # Equal ones can be batched, of whatever kind they are; "same" was compared already.
+    # Equal ones of any kind can be batched; "same" was compared already.
     if mode == "same" or all(each is first or each == first for each in observations):
         return batch_space(first, len(observations))
     return batch_differing_spaces(list(observations))

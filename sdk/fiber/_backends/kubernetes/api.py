@@ -300,7 +300,7 @@ class Api:
 class Watch:
     """The events of one watch, ``{"type": …, "object": …}``, until it ends or ``stop``.
 
-    Any end is one: whoever wants more asks for another watch from where this one came to.
+    Any end is one: a caller that wants more starts another watch where this one ended.
     """
 
     def __init__(self, session: ApiSession, request: ApiRequest) -> None:
@@ -397,7 +397,7 @@ class ApiSession:
         self._client.close()
 
     def send(self, request: ApiRequest, read_timeout: float) -> BaseHTTPResponse:
-        """The response, whatever its status, with the body unread."""
+        """Return the response, with any status, and its body unread."""
         client = self._client
         response = self._send_by(client, request, read_timeout)
         if response.status != 401:
@@ -483,7 +483,7 @@ class Login(NamedTuple):
                 raise ConfigError("there is no such file")
             chosen = package.config.kube_config.KubeConfigLoader(merged, active_context=context)
             namespace = chosen.current_context["context"].get("namespace") or "default"
-        except Exception as error:  # whatever a file may hold
+        except Exception as error:  # a file may hold anything
             reason = " ".join(str(error).split())
             raise ConfigError(
                 f"no cluster to run processes on: {file} cannot be used: {reason}. Let KUBECONFIG "

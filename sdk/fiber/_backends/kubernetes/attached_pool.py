@@ -218,8 +218,8 @@ class AttachedPool:
         return written == (spec.get("holderIdentity"), spec.get("acquireTime"))
 
     def free_lease(self, **how: Any) -> None:
-        """Let whoever comes next find that nobody holds it."""
-        # Whoever may not has lost that right since; the pool itself can be left all the same.
+        """Let the next program find that it has no holder."""
+        # A program may have lost that right since; it can still leave the pool.
         with contextlib.suppress(NotFound, Forbidden):
             self._patch_lease({"holderIdentity": ""}, **how)
 
@@ -521,7 +521,7 @@ class WarmPool:
         attached = self._as_master(found, 1 + max(epoch, seen))
         self._replicas = 0 if there else int(found["spec"].get("replicas") or 0)
         version = found["metadata"]["resourceVersion"]
-        # Whatever becomes of the call, `detach` looks whether the pool is ours.
+        # `detach` looks whether the pool is ours, even if the call fails.
         self._attached = attached
         try:
             attached.apply(self._replicas, resource_version=version, cancel=cancel)

@@ -117,7 +117,7 @@ def running(status: Status) -> int:
 def failure(pool: PoolName, status: Status, joined: int) -> FiberPoolError | None:
     """Why nobody will serve the program, with ``joined`` workers there now.
 
-    A pool with workers goes on with them, whatever is wrong with others.
+    A pool with workers goes on with them, even if others have problems.
     """
     if joined or running(status):
         return None
@@ -452,7 +452,7 @@ class Reporter:
         self._on_error = on_error
         self._on_failure = on_failure
         self._failing = threading.Lock()
-        """Taken by whoever tells of the error, and never given back."""
+        """Taken by the thread that reports the error, and never given back."""
         self._warned: set[str] = set()
         self._muted = False
 
@@ -505,7 +505,7 @@ class Reporter:
         """Report that the pool has failed."""
         if not self._muted and self._failing.acquire(blocking=False):
             self._loop.call_soon(self._on_error, error)
-            self._on_failure()  # whatever that leads to is told later
+            self._on_failure()  # its consequences are reported later
 
     def error(self, reason: str, what: str) -> FiberPoolError:
         """``what``: what is the matter, in words that follow the pool."""

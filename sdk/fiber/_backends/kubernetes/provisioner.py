@@ -84,7 +84,7 @@ class PreparedPool(NamedTuple):
     slots: int
     """Processes that each of its pods runs."""
     min_pods: int
-    """Pods that it keeps whatever is wanted."""
+    """Pods that it keeps even if fewer are wanted."""
     max_pods: int
 
 
@@ -133,7 +133,7 @@ class PoolProvisioner:
             for line in claims.warnings(template):
                 _say(line)
         body = fiber_pool_body(name, template, self._config)
-        # Last: whatever fails before leaves nothing open.
+        # Last: a failure before this leaves nothing open.
         master, listener = self._listen(name, credentials, loop, observer)
         attachment = OwnPool(self._api, self.namespace, body, credentials, master, self._owner(own))
         slots = self._config.processes_per_pod
