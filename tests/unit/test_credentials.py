@@ -116,7 +116,7 @@ def test_the_init_container_imports_the_standard_library_alone(
 
 @pytest.mark.parametrize(
     ("content", "why"),
-    [(None, "no such file or directory"), ("{}", "its content is not Fiber's, or cut short")],
+    [(None, "no such file or directory"), ("{}", "its content is incomplete or not Fiber's")],
 )
 def test_a_file_that_cannot_be_read_is_named_with_the_reason(
     tmp_path: Path, content: str | None, why: str
@@ -136,7 +136,7 @@ def test_a_descriptor_brings_them_once(credentials: MasterCredentials) -> None:
     assert Credentials.from_descriptor(descriptor) == agent
     with pytest.raises(OSError, match="Bad file descriptor"):
         os.fstat(descriptor)
-    with pytest.raises(ConfigError, match="what is cut short"):
+    with pytest.raises(ConfigError, match="its content is incomplete"):
         Credentials.from_descriptor(again)
 
 

@@ -229,7 +229,7 @@ def test_an_observer_that_fails_on_a_frame_loses_the_peer(loop: SimulatedLoop) -
         loop.run_for(1)
     loop.run_for(1)
     assert picky.frames == [b"good"]
-    assert picky.events == ["lost: ValueError on what it said: bad"]
+    assert picky.events == ["lost: ValueError while its message was handled: bad"]
 
 
 def test_a_peer_that_talks_nonsense_is_lost(loop: SimulatedLoop) -> None:

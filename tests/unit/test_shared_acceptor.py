@@ -63,7 +63,7 @@ def test_the_end_of_one_pool_leaves_the_others_and_tells_its_late_agents(
     late = _dial(site, acceptor, pools[0], "late")
     late.wait(lambda: late.errors)
     assert isinstance(late.errors[0], LinkError)
-    assert "this master has given back the pool of this agent" in str(late.errors[0])
+    assert "this master no longer uses the pool of this agent" in str(late.errors[0])
     assert first_master.links == first_master.refusals == []
     before.link.send(b"still here")
     second_master.wait(lambda: second_master.frames == [b"still here"])

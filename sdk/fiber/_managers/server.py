@@ -74,7 +74,7 @@ class ManagerListener:
 
 
 class Server(_mp.Server):  # type: ignore[misc]
-    """Serves a manager's objects to the processes of the program."""
+    """Server of a manager's objects for the processes of the program."""
 
     def __init__(self, *options: Any) -> None:
         super().__init__(*options)
@@ -280,7 +280,7 @@ def _start(target: Any, *args: Any) -> None:
 def _no_object(ident: str) -> KeyError:
     return KeyError(
         f"the manager's object {ident!r} is gone: it went with its last proxy. Keep a proxy until "
-        "the process that was sent one has received it"
+        "the process that gets one has received it"
     )
 
 

@@ -375,7 +375,7 @@ class PendingConnection:
 
 
 def _turn_away(connection: PendingConnection, hello: AgentHello) -> None:
-    reason = "this master has given back the pool of this agent"
+    reason = "this master no longer uses the pool of this agent"
     refusal = MasterRefusal(Identity.of_this_process(MASTER), reason)
     connection.turn_away(refusal.encode(), reason)
 

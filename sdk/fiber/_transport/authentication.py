@@ -411,7 +411,7 @@ class _Handshake:
         while len(data) < size:
             more = yield from self._when_ready(self.sock.recv, size - len(data))
             if not more:
-                raise HungUp("it hung up in the middle of the handshake")
+                raise HungUp("it closed the connection during the handshake")
             data += more
         return data
 
@@ -425,7 +425,7 @@ class _Handshake:
             except ssl.SSLWantWriteError:
                 yield select.POLLOUT
             except (ssl.SSLEOFError, ssl.SSLZeroReturnError, ssl.SSLSyscallError) as error:
-                raise HungUp("it hung up in the middle of the handshake") from error
+                raise HungUp("it closed the connection during the handshake") from error
             except ssl.SSLError as error:
                 raise Untrusted(f"the TLS handshake failed: {_words(error)}") from error
             except OSError as error:
@@ -449,7 +449,9 @@ class AgentHandshake(_Handshake):
         answer = yield from self._read()
         proof = yield from self._read_exactly(_PROOF_SIZE)
         if not answer:
-            raise Untrusted("the master does not believe that this agent is the pod it says")
+            raise Untrusted(
+                "the master does not believe that this agent is the pod it claims to be"
+            )
         if not hmac.compare_digest(proof, self._proof(b"master", credentials.key, seen, answer)):
             raise Untrusted("it cannot prove that it is this pool's master")
         return answer

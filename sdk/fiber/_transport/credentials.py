@@ -44,7 +44,7 @@ class Credentials:
         except OSError as error:
             raise cls._unreadable(path, str(error.strerror or error).lower()) from None
         except (ValueError, KeyError, TypeError, AttributeError):
-            raise cls._unreadable(path, "its content is not Fiber's, or cut short") from None
+            raise cls._unreadable(path, "its content is incomplete or not Fiber's") from None
 
     @staticmethod
     def _unreadable(path: str | os.PathLike[str], why: str) -> ConfigError:
@@ -76,10 +76,10 @@ class Credentials:
             with open(descriptor, "rb") as file:
                 return cls._read(file.read())
         except (OSError, OverflowError, ValueError, KeyError, TypeError, AttributeError):
-            # A descriptor may bring anything.
+            # A descriptor may have any content.
             raise ConfigError(
                 f"the credentials on descriptor {descriptor} cannot be read: it is not open, or "
-                "brings what is cut short or not Fiber's. Hand them over as the master made them."
+                "its content is incomplete or not Fiber's. Pass them on as the master made them."
             ) from None
 
     @classmethod

@@ -60,8 +60,8 @@ def _link_interpreter(folder: Path) -> None:
 
 def _fail(why: str) -> int:
     print(
-        f"fiber agent: the credentials of this pod cannot be written: {why}. The operator sets "
-        "this container up: see the template of the FiberPool for what stands in its way.",
+        f"fiber agent: the credentials of this pod cannot be written: {why}. The operator "
+        "sets this container up. Check the FiberPool's template for settings that prevent it.",
         file=sys.stderr,
     )
     return 1

@@ -253,7 +253,7 @@ class AgentDialer:
         self._fail(
             LinkError(
                 f"no master answered at {self._address} within {self._timeout:g} s: "
-                f"{self._obstacle}. See that it runs and that this host can reach that address."
+                f"{self._obstacle}. Check that it runs and that this host can reach the address."
             )
         )
 
@@ -261,15 +261,15 @@ class AgentDialer:
         self._fail(self._stranger(error))
 
     def _stranger(self, error: ProtocolError) -> LinkError:
-        return LinkError(f"what answers at {self._address} is no master: {error}")
+        return LinkError(f"the peer at {self._address} is no master: {error}")
 
     def _distrust(self) -> None:
         self._fail(
             AuthenticationError(
-                f"this agent and what answers at {self._address} do not trust each other: "
-                f"{self._obstacle}. The agent's credentials come from another run's key or another "
-                "pool's, or it is no master. Give the agent the credentials that this master made; "
-                "in a pool, delete the pod."
+                f"this agent and the peer at {self._address} do not trust each other: "
+                f"{self._obstacle}. The agent's credentials may come from another run's key or "
+                "another pool's, or the peer is no master. Give the agent the credentials that "
+                "this master made; in a pool, delete the pod."
             )
         )
 

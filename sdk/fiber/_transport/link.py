@@ -268,7 +268,7 @@ class Link:
                 observer.on_frame(self._inbox.popleft())
         except Exception as error:
             self._inbox.clear()
-            self._lose(f"{type(error).__name__} on what it said: {error}")
+            self._lose(f"{type(error).__name__} while its message was handled: {error}")
             raise
         if self._lost is not None and (observer := self._observer):
             self._observer = None

@@ -172,8 +172,8 @@ class MasterListener:
             return f"{hello.identity.name!r} wants to go on with the link of {link.peer.name!r}"
         if (link := self._by_peer.get(_peer(hello.identity))) is not None and link.is_connected:
             return (
-                f"{hello.identity.name!r} has a link already, and a pod has one. End the process "
-                "that is not its agent"
+                f"{hello.identity.name!r} has a link already, and a pod has only one. End the "
+                "process that is not its agent"
             )
         return self._knows(hello.identity)
 

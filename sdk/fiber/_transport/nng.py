@@ -76,7 +76,7 @@ _lib, _ffi = _nng.lib, _nng.ffi
 
 
 class Sealer:
-    """The sending side."""
+    """Sealer of the messages in one direction."""
 
     def __init__(
         self, secret: bytes, messages: int = MESSAGES_PER_KEY, size: int = BYTES_PER_KEY
@@ -110,7 +110,7 @@ _opened = _OpenedMessage()
 
 
 class Opener:
-    """The receiving side."""
+    """Opener of the messages in the other direction."""
 
     def __init__(
         self, secret: bytes, messages: int = MESSAGES_PER_KEY, size: int = BYTES_PER_KEY

@@ -539,13 +539,13 @@ def _read_leave(view: memoryview) -> Leave:
 
 def _integer(value: Any) -> int:
     if type(value) is not int:
-        raise ValueError("it has something else where a number belongs")
+        raise ValueError("a field that must be a number is not")
     return value
 
 
 def _string(value: Any) -> str:
     if type(value) is not str:
-        raise ValueError("it has something else where a text belongs")
+        raise ValueError("a field that must be a text is not")
     return value
 
 
