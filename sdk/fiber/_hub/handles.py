@@ -198,11 +198,10 @@ def _inherited_segment(spawning: Any, block: Block) -> DescriptorHandle:
     if inherit is not None:
         segment: DescriptorHandle = inherit(block.segment)
         return segment
-    # multiprocessing's Process takes each descriptor once, and closes it in the child.
+    # multiprocessing's Process takes each descriptor once, and closes it in the child.  It keeps
+    # the duplicate until the child has started.
     duplicate = opened(os.dup, block.segment.fileno())
-    vars(spawning).setdefault("_fiber_duplicates", []).append(
-        duplicate
-    )  # kept until the process has started
+    vars(spawning).setdefault("_fiber_duplicates", []).append(duplicate)
     return _inherited(spawning, duplicate.fileno())
 
 
@@ -392,9 +391,7 @@ class Pickling:
         if self.grants is not None:
             self.grants.release()
         while self.undo:
-            with contextlib.suppress(
-                OSError, ObjectUnreachable
-            ):  # the hub is gone, and all with it
+            with contextlib.suppress(OSError, ObjectUnreachable):  # the hub has ended
                 self.undo.pop()()
 
 

@@ -326,9 +326,7 @@ class HostedSemaphore:
     def abandon(self, holder: str) -> None:
         """Return the token of a process that has ended, with a warning."""
         self._semaphore.abandon(holder)
-        with contextlib.suppress(
-            RuntimeWarning
-        ):  # a filter may make it an error, which would end the hub
+        with contextlib.suppress(RuntimeWarning):  # as an error it would end the hub
             warn_of(holder)
         self.release()
 

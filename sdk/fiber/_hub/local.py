@@ -231,9 +231,7 @@ class Backlog:
                 return False
             self._write(tail, memoryview(size.to_bytes(_LENGTH, "little")))
             self._write(tail + _LENGTH, payload)
-            if (
-                words[TAIL] == tail
-            ):  # otherwise a finalizer or a signal's handler has put a record meanwhile
+            if words[TAIL] == tail:  # otherwise a finalizer or handler has put a record
                 words[TAIL] = end
                 return True
 

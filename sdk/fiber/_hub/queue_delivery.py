@@ -227,9 +227,8 @@ class Feeder:
             moves = self._moves
             size = self._slots.used(len(self._unsent))
             none_moved = moves == self._moves and not moves % 2
-            if (
-                none_moved or threading.get_ident() == self._thread
-            ):  # then this call interrupted the move
+            is_feeder = threading.get_ident() == self._thread  # then it interrupted the move
+            if none_moved or is_feeder:
                 return size
             time.sleep(_MOVE)
 
@@ -319,9 +318,7 @@ class Feeder:
         else:
             try:
                 self._on_error(error, None)
-            except (
-                BaseException
-            ):  # The hook is the user's code.  Other items have to be sent all the same.
+            except BaseException:  # of the user's hook; other items have to be sent all the same
                 report_uncaught()
 
 
@@ -393,9 +390,7 @@ class SlotClaims:
             while True:
                 count = len(own)
                 self._table.hold(entry, count)
-                if count == len(
-                    own
-                ):  # otherwise another thread may have written an older number last
+                if count == len(own):  # otherwise another thread may have written last
                     return
         except (OSError, ObjectUnreachable):
             pass  # the hub has ended, and the queue with it
