@@ -132,7 +132,10 @@ class Abandoned(_Bool):  # type: ignore[misc]  # bool is final
 
 
 class SharedBlock(Protocol):
-    """Block of memory that processes of this host share."""
+    """Block of memory that processes of this host share.
+
+    ``fiber._hub.heap.Block`` implements it, in a layer above this one.
+    """
 
     @property
     def view(self) -> memoryview:

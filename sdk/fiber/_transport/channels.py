@@ -116,22 +116,25 @@ class SharedChannel(Channel, Protocol):
 
 
 class Claimant(Protocol):
-    """Record of how many places of a counter a process holds."""
+    """Record of how many units of a counter a process holds.
+
+    ``fiber._hub.queue_delivery.SlotClaims`` implements it, in a layer above this one.
+    """
 
     def add(self) -> None:
-        """Record one more place."""
+        """Record one more unit."""
 
     def drop(self) -> None:
-        """Record one place less."""
+        """Record one unit less."""
 
 
 class SharedCounter(Counter, Protocol):
-    """Counter of which callers can wait for each change."""
+    """Counter that also lets callers wait for each change."""
 
     def claim(self, timeout: float | None, taken: list[Any], claims: Claimant) -> bool:
         """Take one as ``take`` does, and record it in ``claims``.
 
-        A process that dies in between has taken nothing, or has a claim.
+        A process that dies in between has not taken one, or has a claim.
         """
 
     def changed(self, since: int, timeout: float | None) -> bool:
