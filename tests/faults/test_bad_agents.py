@@ -150,7 +150,7 @@ def test_an_agent_that_is_told_nonsense(
     ("arguments", "status", "words"),
     [
         (["--help"], 0, "FIBER_AGENT_ADDRESS"),
-        (["--port", "7"], 2, "no arguments, but was given '--port 7'"),
+        (["--port", "7"], 2, "unexpected arguments '--port 7'"),
     ],
 )
 def test_an_agent_with_a_command_line(arguments: list[str], status: int, words: str) -> None:

@@ -60,7 +60,7 @@ except fiber.StartError as error:
         {"FIBER_BACKEND": "loopback"},
     )
     assert "file too large while starting an agent" in done.stdout, done.stderr
-    assert "Raise that with `ulimit -f`" in done.stdout
+    assert "with `ulimit -f`" in done.stdout
     assert "Traceback" not in done.stderr
 
 
