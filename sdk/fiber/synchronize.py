@@ -350,7 +350,7 @@ class Barrier(threading.Barrier):
 
     def _bury(self) -> bool:
         """Stop counting members that died; tell whether there were any."""
-        died = self._cond._waiters.bury() + self._members.bury()
+        died = self._cond._waiters.remove_dead() + self._members.remove_dead()
         if died:
             self._members.set(1, self._members.held())
         return bool(died)

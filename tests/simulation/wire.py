@@ -68,7 +68,7 @@ class Wire:
             return None
         if head.kind == work.CALLS:
             calls = [
-                pickle.loads(work.found(call, [])[0])[1]
+                pickle.loads(work.take_beside(call, [])[0])[1]
                 for call, _ in work.unpack_calls(body, head.size)
             ]
             if calls == [()]:

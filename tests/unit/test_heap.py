@@ -31,7 +31,7 @@ class SharedBytes:
 
 
 def _rebuild(handle: BlockHandle) -> Any:
-    return handle.elsewhere() or SharedBytes(handle.block())
+    return handle.remote_handle() or SharedBytes(handle.block())
 
 
 def _write_each(*shared: SharedBytes) -> None:
@@ -149,10 +149,10 @@ def test_the_doorbell_is_heard_at_the_hub() -> None:
     try:
         with hosts.at("here") as hub:
             hosts.on_loop(hub.doorbell.listen, lambda: heard.put(None))
-            handles.ring()
+            handles.ring_doorbell()
             heard.get(timeout=PATIENCE)
         with hosts.child_at("here"):
-            handles.ring()
+            handles.ring_doorbell()
             heard.get(timeout=PATIENCE)
     finally:
         hosts.close()

@@ -52,7 +52,7 @@ class Channel:
             assert offset == len(found), "results out of order"
             rest = iter(buffers)
             for position, kind, data, count in odd:
-                pickled, beside = work.found(data, [next(rest) for _ in range(count)])
+                pickled, beside = work.take_beside(data, [next(rest) for _ in range(count)])
                 value = pickle.loads(pickled, buffers=beside)
                 values[position] = value if kind == work.VALUE else (kind, value)
             found += values
@@ -82,15 +82,15 @@ class Rig:
         data, beside = b"", []
         size = 0
         if function is not None:
-            data, beside = work.beside((pickle.dumps(function), []))
+            data, beside = work.move_beside((pickle.dumps(function), []))
             size = len(data) or work.BESIDE
         head = work.Head(kind, stride, unit, identity, size, len(beside))
-        body, buffers = work.beside(packet.dumps(items))
+        body, buffers = work.move_beside(packet.dumps(items))
         return self._handle(work.pack_batch(head, data, body), [*beside, *buffers])
 
     def call(self, *calls: tuple[Any, ...]) -> int:
         """Have calls (function, args, kwargs) run."""
-        pickles = [work.beside(packet.dumps(call)) for call in calls]
+        pickles = [work.move_beside(packet.dumps(call)) for call in calls]
         buffers = [buffer for _, beside in pickles for buffer in beside]
         return self._handle(work.pack_calls(pickles), buffers)
 

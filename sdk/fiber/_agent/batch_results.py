@@ -132,7 +132,7 @@ class BatchResults:
         self._enclose(position, work.VALUE, (data, buffers))
 
     def _enclose(self, position: int, kind: int, pickled: work.Pickle) -> None:
-        data, buffers = work.beside(pickled)
+        data, buffers = work.move_beside(pickled)
         self._buffers += buffers
         self._encoded.append((position, kind, data or None, len(buffers)))
 

@@ -129,7 +129,7 @@ class BatchRunner:
                 return
             pickled = body if head.size == work.BESIDE else body[head.size :]
             try:
-                items, taken = loads(*work.found(pickled or None, buffers[head.buffers :]))
+                items, taken = loads(*work.take_beside(pickled or None, buffers[head.buffers :]))
             except BaseException as error:
                 self._reply(work.UNREADABLE, seq, encode_error(error))
                 return
@@ -149,7 +149,7 @@ class BatchRunner:
         try:
             self._interruptible = True
             ((data, _),) = work.unpack_calls(body, 1)
-            (function, args, kwargs), taken = loads(*work.found(data, buffers))
+            (function, args, kwargs), taken = loads(*work.take_beside(data, buffers))
             del data
             buffers.clear()  # frees unused buffers during the call
             value = function(*args, **kwargs)
@@ -205,7 +205,7 @@ class BatchRunner:
         functions = self._functions
         if head.size:
             inline = None if head.size == work.BESIDE else body[: head.size]
-            data, beside = work.found(inline, buffers[: head.buffers])
+            data, beside = work.take_beside(inline, buffers[: head.buffers])
             try:
                 function = pickle.loads(data, buffers=beside)
             except BaseException as error:
@@ -379,7 +379,7 @@ class _Caller:
 
     def __call__(self, call: tuple[memoryview | None, int]) -> Any:
         data, count = call
-        pickled = work.found(data, list(islice(self._buffers, count)))
+        pickled = work.take_beside(data, list(islice(self._buffers, count)))
         (function, args, kwargs), taken = loads(*pickled)
         self._taken += taken
         return function(*args, **kwargs)

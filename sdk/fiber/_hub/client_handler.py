@@ -479,9 +479,9 @@ class ClientHandler:
         """Reply with the number of waiters."""
         self._request(message).answer(Status.OK, self._wait_list().places.waiters())
 
-    def bury(self, message: Message) -> None:
+    def remove_dead(self, message: Message) -> None:
         """Reply with the number of waiters that died."""
-        self._request(message).answer(Status.OK, self._wait_list().places.bury())
+        self._request(message).answer(Status.OK, self._wait_list().places.remove_dead())
 
     def hold(self, message: Message) -> None:
         """Note how many things the process of this stream has."""

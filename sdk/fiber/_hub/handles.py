@@ -72,7 +72,7 @@ class HubHandle(NamedTuple):
     def __repr__(self) -> str:
         return f"HubHandle(home={self.home!r})"
 
-    def here(self) -> bool:
+    def is_local(self) -> bool:
         """Tell whether the hub is on this host."""
         return self.home.host == client.host()
 
@@ -104,10 +104,10 @@ class BlockHandle(NamedTuple):
     segment: Handle
     extent: Extent
 
-    def elsewhere(self) -> HubHandle | None:
+    def remote_handle(self) -> HubHandle | None:
         """Return the handle at the hub of another host; None for a block of this host."""
         segment = self.segment
-        return segment if isinstance(segment, HubHandle) and not segment.here() else None
+        return segment if isinstance(segment, HubHandle) and not segment.is_local() else None
 
     def block(self) -> Block:
         """Return the block, on its own host."""
@@ -127,7 +127,7 @@ class EndHandle(NamedTuple):
 
     def end(self) -> SharedChannel:
         """Return the end for the process that unpickled the handle."""
-        if isinstance(self.socket, HubHandle) and not self.socket.here():
+        if isinstance(self.socket, HubHandle) and not self.socket.is_local():
             return RemoteEnd(self.kind, self.extent, *self.socket)
         socket, *beside = _descriptors(self.socket)
         (segment,) = beside if self.segment is None else _descriptors(self.segment)
@@ -146,14 +146,14 @@ def channel(handle: Handle | EndHandle) -> SharedChannel:
     """Return the channel of an unpickled handle."""
     if isinstance(handle, EndHandle):
         return handle.end()
-    if isinstance(handle, HubHandle) and not handle.here():
+    if isinstance(handle, HubHandle) and not handle.is_local():
         return RemoteChannel(*handle)
     return LocalChannel(*_descriptors(handle))
 
 
 def counter(handle: Handle) -> SharedCounter:
     """Return the counter of an unpickled handle."""
-    if isinstance(handle, HubHandle) and not handle.here():
+    if isinstance(handle, HubHandle) and not handle.is_local():
         return RemoteCounter(*handle)
     return LocalCounter(*_descriptors(handle))
 
@@ -395,7 +395,7 @@ class Pickling:
                 self.undo.pop()()
 
 
-def ring() -> None:
+def ring_doorbell() -> None:
     """Ring the doorbell of this host's hub, so that it looks at shared memory again.
 
     Never waits.  If the hub cannot be reached, it looks again by itself some time later.

@@ -119,7 +119,7 @@ class Op(IntEnum):
     LEAVE = 52  # NO if the stream's place was not notified
     NOTIFY = 53  # number of waiters
     WAITERS = 54  # -> number of waiters
-    BURY = 55  # -> number of waiters that died
+    REMOVE_DEAD = 55  # -> number of waiters that died
     GET = 56  # which -> the word
     SET = 57  # which, the word
     HOLD = 58  # number of things of the stream's process; silent

@@ -26,7 +26,7 @@ from fiber._hub.handles import (
     HubHandle,
     handle_for_block,
     handle_for_remote_block,
-    ring,
+    ring_doorbell,
 )
 from fiber._hub.heap import Block, block_of
 from fiber._hub.protocol import ONE, SECRET, TWO, Extent, ObjectKind, Op, Origin, Status
@@ -82,7 +82,7 @@ def create_buffer(size: int) -> SharedBuffer:
 
 
 def _rebuild_buffer(handle: BlockHandle) -> SharedBuffer:
-    home = handle.elsewhere()
+    home = handle.remote_handle()
     if home is None:
         return SharedBuffer(handle.block())
     return ReplicaBuffer(home, handle.extent)
@@ -201,19 +201,21 @@ _semaphores: weakref.WeakValueDictionary[tuple[object, ...], AnySemaphore] = (
 def create_semaphore(kind: int, value: int, maximum: int) -> SharedSemaphore:
     """Return a new semaphore with ``value`` of at most ``maximum`` tokens."""
     block = heap.allocate(SEMAPHORE_SIZE)
-    new = _semaphores[block.identity] = SharedSemaphore.create(block, kind, value, maximum, ring)
+    new = _semaphores[block.identity] = SharedSemaphore.create(
+        block, kind, value, maximum, ring_doorbell
+    )
     return new
 
 
 def _rebuild_semaphore(handle: BlockHandle, kind: int, maximum: int) -> AnySemaphore:
-    home = handle.elsewhere()
+    home = handle.remote_handle()
     if home is not None:
         remote = RemoteSemaphore(home, handle.extent, kind, maximum)
         return _semaphores.setdefault((home.identity,), remote)
     block = handle.block()
     known = _semaphores.get(block.identity)
     if known is None:
-        known = _semaphores.setdefault(block.identity, SharedSemaphore(block, kind, ring))
+        known = _semaphores.setdefault(block.identity, SharedSemaphore(block, kind, ring_doorbell))
     return known
 
 
@@ -280,9 +282,9 @@ class RemoteWaitList(RemoteObject):
         """Return the number of waiters."""
         return self._ask(Op.WAITERS, 0)
 
-    def bury(self) -> int:
+    def remove_dead(self) -> int:
         """Free the places of dead waiters; return their number."""
-        return self._ask(Op.BURY, 0)
+        return self._ask(Op.REMOVE_DEAD, 0)
 
     def hold(self, place: HubStream, number: int) -> None:
         """Note how many things the process at ``place`` has.  Never waits."""
@@ -323,14 +325,14 @@ AnyWaitList: TypeAlias = WaitList | RemoteWaitList
 
 def create_wait_list() -> WaitList:
     """Return a new, empty wait list."""
-    return WaitList(heap.allocate(WAIT_LIST_SIZE), ring)
+    return WaitList(heap.allocate(WAIT_LIST_SIZE), ring_doorbell)
 
 
 def _rebuild_wait_list(handle: BlockHandle) -> AnyWaitList:
-    home = handle.elsewhere()
+    home = handle.remote_handle()
     if home is not None:
         return RemoteWaitList(home, handle.extent)
-    return WaitList(handle.block(), ring)
+    return WaitList(handle.block(), ring_doorbell)
 
 
 def _reduce_wait_list(waiters: WaitList) -> tuple[Any, ...]:

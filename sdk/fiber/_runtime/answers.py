@@ -88,7 +88,7 @@ def outcomes(
             raise ValueError("a pickled value has no place, or not its buffers")
         if not (type(data) is bytes or (data is None and count)):
             raise ValueError("a pickled value is not there")
-        values[position] = Pickled(kind, *work.found(data, buffers[used : used + count]))
+        values[position] = Pickled(kind, *work.take_beside(data, buffers[used : used + count]))
         used += count
     return values
 

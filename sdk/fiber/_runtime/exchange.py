@@ -290,14 +290,14 @@ def _encode(item: WorkItem, batch: Batch, *, plain: bool) -> Encoded:
         buffers = list(chain.from_iterable(call.buffers for call in calls))
         return work.pack_calls([(call.data, call.buffers) for call in calls]), buffers
     if plain:
-        return work.beside((pickle.dumps(batch.items, 5), []))
+        return work.move_beside((pickle.dumps(batch.items, 5), []))
     items = tuple(batch.items) if type(batch.items) is list else batch.items
     data, buffers, grants = reduction.encode_reusable(items)
     if grants is not None:
         item.grants.append(grants)
     if len(buffers) > work.BUFFERS:
         data, buffers = reduction.dumps(batch.items, 5), []
-    return work.beside((data, buffers))
+    return work.move_beside((data, buffers))
 
 
 def _pack(item: WorkItem, batch: Batch, encoded: Encoded, sent: dict[int, None]) -> Encoded:

@@ -77,7 +77,7 @@ class FunctionCache:
         known = self._known.get(data)
         if known is not None:
             return known
-        sent = work.beside((data, buffers))
+        sent = work.move_beside((data, buffers))
         made = Function(next(self._ids), name_of(function), *sent, grants)
         if not buffers and grants is None and len(data) <= FUNCTION_SIZE:
             if len(self._known) >= FUNCTIONS:
@@ -363,7 +363,7 @@ def pickle_call(
     except Exception as error:
         reject(future, _blame_call(function, args, kwargs, error))
         return None
-    return Call(name_of(function), *work.beside((data, buffers)), grants, future, blocking)
+    return Call(name_of(function), *work.move_beside((data, buffers)), grants, future, blocking)
 
 
 def _blame_call(

@@ -110,7 +110,7 @@ class WaitList:
         """Return the number of waiters."""
         return sum(self._words[place] in (_WAITS, _WAITS_AFAR) for place in self._used())
 
-    def bury(self) -> int:
+    def remove_dead(self) -> int:
         """Free the places of dead waiters; return their number."""
         dead = [place for place in self._used() if self._is_dead(place)]
         for place in dead:

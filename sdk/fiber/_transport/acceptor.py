@@ -226,12 +226,12 @@ class PendingConnection:
             sock, acceptor.context, acceptor.certificate
         )
         self._timer = self._loop.call_later(_DEADLINE, self._too_late)
-        self._run(self._handshake.listen(), self._hear)
+        self._run(self._handshake.listen(), self._on_hello)
 
-    def _hear(self, words: bytes) -> None:
+    def _on_hello(self, greeting: bytes) -> None:
         """Find the pool of the agent by its greeting and its proof."""
         try:
-            hello = authentication.decode_greeting(words)
+            hello = authentication.decode_greeting(greeting)
         except ProtocolError as error:
             self._distrust(f"it is no agent of Fiber: {error}")
             return
@@ -244,14 +244,14 @@ class PendingConnection:
         )
         if self._pool is None:
             self._acceptor.report(self._host, self.origin, f"it cannot prove that it is {name!r}")
-            self._run(self._handshake.disbelieve(), lambda _: self._part())
+            self._run(self._handshake.disbelieve(), lambda _: self._close_after_alert())
         else:
             self._acceptor.make_room(self)
             self._pool.on_agent(self, hello)
 
     def _distrust(self, reason: str) -> None:
         self._acceptor.report(self._host, self.origin, reason)
-        self._part()
+        self._close_after_alert()
 
     def waits_for(self, what: str) -> None:
         """Note what the agent waits for, as the reason if the deadline passes.  Any thread."""
@@ -326,7 +326,7 @@ class PendingConnection:
                 then(finished.value)
             except (authentication.Untrusted, authentication.HungUp, ProtocolError) as error:
                 self._acceptor.report(self._host, self.origin, str(error))
-                self._part()
+                self._close_after_alert()
 
         step()
 
@@ -342,7 +342,7 @@ class PendingConnection:
             self._loop.unregister(self._watched)
             self._watched = None
 
-    def _part(self) -> None:
+    def _close_after_alert(self) -> None:
         """Give the peer time to read the TLS alert, then hang up."""
         self._unwatch()
         sock = self._handshake.sock

@@ -315,7 +315,8 @@ def master_context(certificate: Certificate) -> ssl.SSLContext:
         _load_own(context, certificate)
     except (ssl.SSLError, ValueError) as error:
         raise AuthenticationError(
-            f"the master's certificate cannot be used: {_words(error)}. It is cut short or not PEM."
+            f"the master's certificate cannot be used: {_reason(error)}. It is incomplete or not "
+            "PEM. Make it again."
         ) from error
     return context
 
@@ -367,7 +368,7 @@ class _Handshake:
             )
         except OSError as error:
             sock.close()
-            raise HungUp(_words(error)) from error
+            raise HungUp(_reason(error)) from error
 
     def end(self) -> Steps[tuple[int, Secrets]]:
         """End TLS in order; return the descriptor of the bare connection and the secrets.
@@ -388,10 +389,10 @@ class _Handshake:
             return self._theirs, self._ours
         return self._ours, self._theirs
 
-    def _proof(self, side: bytes, key: str, certificate: bytes, words: bytes) -> bytes:
-        """Compute the proof of ``side`` for the greeting ``words``."""
+    def _proof(self, side: bytes, key: str, certificate: bytes, greeting: bytes) -> bytes:
+        """Compute the proof of ``side`` for ``greeting``."""
         agent, master = self._nonces
-        said = b"fiber " + side + agent + master + certificate + words
+        said = b"fiber " + side + agent + master + certificate + greeting
         return hmac.digest(bytes.fromhex(key), said, "sha256")
 
     def _write(self, data: bytes) -> Steps[None]:
@@ -427,9 +428,9 @@ class _Handshake:
             except (ssl.SSLEOFError, ssl.SSLZeroReturnError, ssl.SSLSyscallError) as error:
                 raise HungUp("it closed the connection during the handshake") from error
             except ssl.SSLError as error:
-                raise Untrusted(f"the TLS handshake failed: {_words(error)}") from error
+                raise Untrusted(f"the TLS handshake failed: {_reason(error)}") from error
             except OSError as error:
-                raise HungUp(_words(error)) from error
+                raise HungUp(_reason(error)) from error
 
 
 class AgentHandshake(_Handshake):
@@ -468,21 +469,21 @@ class MasterHandshake(_Handshake):
         super().__init__(sock, context)
         self._certificate = certificate.hash
         self._key = ""
-        self._words = self._said = b""
+        self._greeting = self._agent_proof = b""
 
     def listen(self) -> Steps[bytes]:
         """Return the agent's hello, before its proof is checked."""
         yield from self._when_ready(self.sock.do_handshake)
         yield from self._write(self._ours)
         self._theirs = yield from self._read_exactly(SECRET_SIZE)
-        self._words = yield from self._read()
-        self._said = yield from self._read_exactly(_PROOF_SIZE)
-        return self._words
+        self._greeting = yield from self._read()
+        self._agent_proof = yield from self._read_exactly(_PROOF_SIZE)
+        return self._greeting
 
     def believes(self, key: str) -> bool:
         """Tell whether the agent has ``key``.  If so, the master proves itself by this key."""
-        proof = self._proof(b"agent", key, self._certificate, self._words)
-        if not hmac.compare_digest(proof, self._said):
+        proof = self._proof(b"agent", key, self._certificate, self._greeting)
+        if not hmac.compare_digest(proof, self._agent_proof):
             return False
         self._key = key
         return True
@@ -497,7 +498,7 @@ class MasterHandshake(_Handshake):
         yield from self._write(_LENGTH.pack(0) + bytes(_PROOF_SIZE))
 
 
-def _words(error: Exception) -> str:
+def _reason(error: Exception) -> str:
     if isinstance(error, ssl.SSLError) and error.reason:
         return error.reason.lower().replace("_", " ")
     if isinstance(error, OSError) and error.strerror:

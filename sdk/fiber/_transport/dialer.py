@@ -131,7 +131,7 @@ class AgentDialer:
         while not self._pause(began, pause):
             began = time.monotonic()
             try:
-                met = self._meet(hello)
+                exchanged = self._exchange_greetings(hello)
             except authentication.Untrusted as error:
                 self._obstacle = str(error)
                 if self._link is None:
@@ -144,7 +144,7 @@ class AgentDialer:
                 # No master listens yet, or there is no route to it yet.
                 self._obstacle = str(error)
             else:
-                self._loop.call_soon(self._answered, *met)
+                self._loop.call_soon(self._answered, *exchanged)
                 return
             pause = min(max(2 * pause, _PAUSE_MIN), _PAUSE_MAX)
 
@@ -153,7 +153,7 @@ class AgentDialer:
         until = since + seconds * random.uniform(0.5, 1.0)
         return self._over.wait(max(until - time.monotonic(), 0.0))
 
-    def _meet(self, hello: bytes) -> tuple[bytes, int, Secrets]:
+    def _exchange_greetings(self, hello: bytes) -> tuple[bytes, int, Secrets]:
         """Connect and exchange greetings; return the answer and the connection without TLS."""
         sock = self._connect(self._address)
         tls_handshake = authentication.AgentHandshake(sock, self._context)
@@ -194,14 +194,14 @@ class AgentDialer:
             os.close(descriptor)
             return
         try:
-            welcome = self._welcome_in(answer)
+            welcome = self._check_answer(answer)
         except (FiberError, AuthenticationError) as error:
             os.close(descriptor)
             self._fail(error)
         else:
             self._welcomed(welcome, descriptor, secrets)
 
-    def _welcome_in(self, answer: bytes) -> MasterWelcome:
+    def _check_answer(self, answer: bytes) -> MasterWelcome:
         """Return the welcome in the answer of the master; raise an error if it is none."""
         try:
             greeting = authentication.decode_greeting(answer)

@@ -84,7 +84,7 @@ Pickle = tuple[bytes, Sequence[memoryview]]
 """Pickle, and the buffers beside it."""
 
 
-def beside(pickle: Pickle) -> Pickle:
+def move_beside(pickle: Pickle) -> Pickle:
     """Move a large pickle to its buffers, so that it is not copied on its way."""
     data, buffers = pickle
     if len(data) <= INLINE_LIMIT:
@@ -92,13 +92,15 @@ def beside(pickle: Pickle) -> Pickle:
     return b"", [memoryview(data), *buffers]
 
 
-def found(data: BytesLike | None, buffers: list[memoryview]) -> tuple[BytesLike, list[memoryview]]:
-    """Undo ``beside``: return a pickle and its other buffers."""
+def take_beside(
+    data: BytesLike | None, buffers: list[memoryview]
+) -> tuple[BytesLike, list[memoryview]]:
+    """Undo ``move_beside``: return a pickle and its other buffers."""
     return (buffers[0], buffers[1:]) if data is None else (data, buffers)
 
 
 def pack_calls(calls: Sequence[Pickle]) -> bytes:
-    """Return a message of pickled calls that went through ``beside``."""
+    """Return a message of pickled calls that went through ``move_beside``."""
     if len(calls) == 1:
         data, buffers = calls[0]
         return HEAD.pack(CALLS, 0, 1, 0, 1, 0) + _entry(data, buffers) + data
