@@ -151,7 +151,7 @@ def test_nonsense_over_tls_is_not_unpickled(
     trace = tmp_path / "unpickled"
     made = backend._credentials if pool == "this one" else make_credentials()
     credentials = replace(made.agent("loopback-0", "uid"), master="")
-    with pytest.raises(authentication.HungUp):
+    with pytest.raises(authentication.PeerClosed):
         say(backend._listener.address, credentials, pickle.dumps(Bomb(trace)))
     works()
     assert not trace.exists()

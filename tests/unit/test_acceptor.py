@@ -255,7 +255,7 @@ def test_closing_hangs_up_on_who_is_under_way(site: Site) -> None:
 def test_nonsense_in_place_of_a_greeting_is_told_once(site: Site) -> None:
     listener, master = site.listener()
     for _ in range(3):
-        with pytest.raises(authentication.HungUp):
+        with pytest.raises(authentication.PeerClosed):
             say(listener.address, site.credentials.agent("a", ""), b"GET / HTTP/1.1")
     master.wait(lambda: master.refusals)
     site.on_loop(lambda: None)
@@ -269,7 +269,7 @@ def test_a_name_that_no_pod_can_have_is_not_repeated(
 ) -> None:
     listener, master = site.listener()
     hello = AgentHello(Identity.of_this_process(name), "0" * 32, 0, False)
-    with pytest.raises(authentication.HungUp):
+    with pytest.raises(authentication.PeerClosed):
         say(listener.address, site.credentials.agent("a", ""), hello.encode())
     master.wait(lambda: master.refusals)
     assert len(master.refusals[0]) < 500

@@ -300,7 +300,7 @@ def test_another_patch_level_of_python_will_do(site: Site) -> None:
 
 def test_who_is_no_agent_is_refused(site: Site) -> None:
     listener, master = site.listener()
-    with pytest.raises(authentication.HungUp):
+    with pytest.raises(authentication.PeerClosed):
         say(listener.address, site.credentials.agent("a", "uid"), b"GET / HTTP/1.1")
     master.wait(lambda: master.refusals)
     assert "no agent of Fiber" in master.refusals[0]

@@ -1,4 +1,4 @@
-"""Accepts connections of agents that prove in time which pod of which pool they are.
+"""Acceptor of connections from agents that prove in time which pod of which pool they are.
 
 The acceptor has its own thread and loop.  A TLS handshake costs milliseconds of processor time.  A
 thousand agents, or strangers without end, must not hold up the program's loop: one thread serves
@@ -77,7 +77,7 @@ class ServedPool(NamedTuple):
 
 
 class Acceptor:
-    """Listens on ``address``, for the agents of any number of pools.
+    """Listener on ``address`` for the agents of any number of pools.
 
     Port 0 takes a free port, and a range such as 9000-9009 its first free port; the attribute
     ``address`` has the port.  Connections are accepted once there is a pool.
@@ -129,7 +129,7 @@ class Acceptor:
         self.loop.call_soon(self._admit, sock, origin, origin)
 
     def close(self) -> None:
-        """Stop accepting, and hang up on pending connections.  Do not call it on its own thread."""
+        """Stop accepting, and close pending connections.  Do not call it on its own thread."""
         self.loop.call_soon(self._close)
         self.loop.stop()
 
@@ -194,7 +194,7 @@ class Acceptor:
         self._pending.add(connection)
         try:
             connection.start(sock)
-        except authentication.HungUp:
+        except authentication.PeerClosed:
             self.forget(connection)
 
     def _close(self) -> None:
@@ -202,7 +202,7 @@ class Acceptor:
             self.loop.unregister(self._listener.fileno())
             self._listener.close()
         for connection in list(self._pending):
-            connection.hang_up()
+            connection.close()
 
 
 class PendingConnection:
@@ -218,7 +218,7 @@ class PendingConnection:
         self._pool: ServedPool | None = None
 
     def start(self, sock: socket.socket) -> None:
-        """Begin the handshake; HungUp if the peer has hung up already."""
+        """Begin the handshake; PeerClosed if the peer has closed it already."""
         with contextlib.suppress(OSError):  # no TCP, or broken already
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         acceptor = self._acceptor
@@ -258,8 +258,8 @@ class PendingConnection:
         self._awaited = what
 
     def drop(self) -> None:
-        """Hang up without an answer.  Any thread."""
-        self._loop.call_soon(lambda: None if self.gone else self.hang_up())
+        """Close the connection without an answer.  Any thread."""
+        self._loop.call_soon(lambda: None if self.gone else self.close())
 
     def welcome(self, greeting: bytes, then: Callable[[int, Secrets], None]) -> None:
         """Answer the agent and end TLS.  Any thread.
@@ -269,7 +269,7 @@ class PendingConnection:
         self._loop.call_soon(self._answer, greeting, lambda end: then(*end))
 
     def turn_away(self, greeting: bytes, reason: str) -> None:
-        """Answer the agent, hang up, and report the refusal.  Any thread."""
+        """Answer the agent, close the connection, and report the refusal.  Any thread."""
         self.report_proven(reason)
         self._loop.call_soon(self._answer, greeting, lambda end: os.close(end[0]))
 
@@ -293,15 +293,15 @@ class PendingConnection:
 
     @property
     def gone(self) -> bool:
-        """True if one of the two sides has hung up."""
+        """True if one of the two sides has closed the connection."""
         return self._handshake.sock.fileno() < 0
 
     def refuse(self, what: str) -> None:
-        """Hang up, and report the reason."""
+        """Close the connection, and report the reason."""
         self._acceptor.report(self._host, self.origin, what)
-        self.hang_up()
+        self.close()
 
-    def hang_up(self) -> None:
+    def close(self) -> None:
         """Close the connection without an answer."""
         self._unwatch()
         self._handshake.close()
@@ -324,7 +324,7 @@ class PendingConnection:
             except StopIteration as finished:
                 self._unwatch()
                 then(finished.value)
-            except (authentication.Untrusted, authentication.HungUp, ProtocolError) as error:
+            except (authentication.Untrusted, authentication.PeerClosed, ProtocolError) as error:
                 self._acceptor.report(self._host, self.origin, str(error))
                 self._close_after_alert()
 
@@ -343,16 +343,16 @@ class PendingConnection:
             self._watched = None
 
     def _close_after_alert(self) -> None:
-        """Give the peer time to read the TLS alert, then hang up."""
+        """Give the peer time to read the TLS alert, then close the connection."""
         self._unwatch()
         sock = self._handshake.sock
         try:
             socket.socket.shutdown(sock, socket.SHUT_WR)
-        except OSError:  # it has hung up itself
-            self.hang_up()
+        except OSError:  # the peer has closed it
+            self.close()
             return
         self._timer.cancel()
-        self._timer = self._loop.call_later(_LAST_WORD, self.hang_up)
+        self._timer = self._loop.call_later(_LAST_WORD, self.close)
         self._watched = sock.fileno()
         self._loop.register(self._watched, self._drain)
 
@@ -364,12 +364,12 @@ class PendingConnection:
         except OSError:
             rest = b""
         if not rest:
-            self.hang_up()
+            self.close()
 
     def _too_late(self) -> None:
         if self._awaited:  # a proven agent: no number of strangers suppresses this report
             self.report_proven(f"{self._awaited}, and there was none within {_DEADLINE:g} s")
-            self.hang_up()
+            self.close()
         else:
             self.refuse(f"it did not prove itself within {_DEADLINE:g} s")
 

@@ -136,7 +136,7 @@ Greeting: TypeAlias = AgentHello | MasterWelcome | MasterRefusal
 
 
 def decode_greeting(datagram: bytes) -> Greeting:
-    """Read a greeting; ProtocolError if it is none."""
+    """Read a greeting; ProtocolError if it is malformed."""
     reader = _READERS.get(datagram[0]) if datagram else None
     if reader is None:
         raise ProtocolError(f"its first {len(datagram)} bytes are no greeting")
@@ -292,7 +292,7 @@ class Untrusted(Exception):
     """Error: the peer has no valid proof, refused the proof of this side, or has no TLS 1.3."""
 
 
-class HungUp(Exception):
+class PeerClosed(Exception):
     """Error: the peer closed the connection during the handshake."""
 
 
@@ -304,7 +304,7 @@ class _TakenSocket(ssl.SSLSocket):
     """
 
     def getpeername(self) -> None:
-        """Return nothing, so that the ssl module does not ask the kernel."""
+        """Do nothing, so that the ssl module does not ask the kernel."""
 
 
 def master_context(certificate: Certificate) -> ssl.SSLContext:
@@ -349,7 +349,7 @@ def _load_own(context: ssl.SSLContext, certificate: Certificate) -> None:
 class _Handshake:
     """Handshake of one side.  It takes over ``sock`` and makes it non-blocking.
 
-    HungUp if the connection has broken already.
+    PeerClosed if the connection has broken already.
     """
 
     _for_master: bool
@@ -368,7 +368,7 @@ class _Handshake:
             )
         except OSError as error:
             sock.close()
-            raise HungUp(_reason(error)) from error
+            raise PeerClosed(_reason(error)) from error
 
     def end(self) -> Steps[tuple[int, Secrets]]:
         """End TLS in order; return the descriptor of the bare connection and the secrets.
@@ -412,7 +412,7 @@ class _Handshake:
         while len(data) < size:
             more = yield from self._when_ready(self.sock.recv, size - len(data))
             if not more:
-                raise HungUp("it closed the connection during the handshake")
+                raise PeerClosed("it closed the connection during the handshake")
             data += more
         return data
 
@@ -426,11 +426,11 @@ class _Handshake:
             except ssl.SSLWantWriteError:
                 yield select.POLLOUT
             except (ssl.SSLEOFError, ssl.SSLZeroReturnError, ssl.SSLSyscallError) as error:
-                raise HungUp("it closed the connection during the handshake") from error
+                raise PeerClosed("it closed the connection during the handshake") from error
             except ssl.SSLError as error:
                 raise Untrusted(f"the TLS handshake failed: {_reason(error)}") from error
             except OSError as error:
-                raise HungUp(_reason(error)) from error
+                raise PeerClosed(_reason(error)) from error
 
 
 class AgentHandshake(_Handshake):

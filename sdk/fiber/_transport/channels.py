@@ -318,7 +318,7 @@ class UnixChannel:
         return message
 
     def try_recv(self) -> Message | None:
-        """Return the next message if one is there; EOFError at the end."""
+        """Return the next message if one is there; ConnectionClosed at the end."""
         try:
             return packet.receive(self._sock, wait=False)
         except BlockingIOError:

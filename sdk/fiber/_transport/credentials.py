@@ -56,7 +56,7 @@ class Credentials:
         )
 
     def to_descriptor(self) -> int:
-        """Return a descriptor from which its heir can read the credentials, once."""
+        """Return a descriptor from which another process can read the credentials, once."""
         values = json.dumps(asdict(self)).encode()
         reader, writer = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
         try:
@@ -103,7 +103,7 @@ class Certificate:
 
     @cached_property
     def hash(self) -> bytes:
-        """The SHA-256 of the certificate."""
+        """SHA-256 of the certificate."""
         import ssl
 
         return hashlib.sha256(ssl.PEM_cert_to_DER_cert(self.text)).digest()

@@ -140,7 +140,7 @@ class AgentDialer:
             except ProtocolError as error:
                 self._loop.call_soon(self._no_master, error)
                 return
-            except (MasterUnreachable, authentication.HungUp) as error:
+            except (MasterUnreachable, authentication.PeerClosed) as error:
                 # No master listens yet, or there is no route to it yet.
                 self._obstacle = str(error)
             else:
@@ -202,7 +202,7 @@ class AgentDialer:
             self._welcomed(welcome, descriptor, secrets)
 
     def _check_answer(self, answer: bytes) -> MasterWelcome:
-        """Return the welcome in the answer of the master; raise an error if it is none."""
+        """Return the welcome in the answer of the master; raise an error if it is a refusal."""
         try:
             greeting = authentication.decode_greeting(answer)
         except ProtocolError as error:

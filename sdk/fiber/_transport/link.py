@@ -221,7 +221,9 @@ class Link:
             return
         if datagram[:1] == _CLOSE:
             connection.put(_CLOSE_ACK)
-            self._lose(str(datagram[1:], "utf-8", "replace") or "it closed the link", hang_up=False)
+            self._lose(
+                str(datagram[1:], "utf-8", "replace") or "it closed the link", disconnects=False
+            )
         elif datagram == _CLOSE_ACK:
             if self._state is _LinkState.LEAVING:
                 self._end()
@@ -357,12 +359,12 @@ class Link:
         else:
             self._end()
 
-    def _lose(self, reason: str, *, hang_up: bool = True) -> None:
+    def _lose(self, reason: str, *, disconnects: bool = True) -> None:
         if self._state is _LinkState.ENDED:
             return
         if self._state is _LinkState.OPEN:
             self._lost = reason
-        if hang_up:
+        if disconnects:
             self._end()
         else:
             self._stop()

@@ -391,7 +391,7 @@ class LinkProtocol:
     def received(self, datagram: BytesLike, now: float) -> list[Frame]:
         """Take a datagram from the connection; return copies of the frames that it completes.
 
-        ProtocolError if no stream can have sent it, ``Gap`` if an earlier datagram is missing.
+        ProtocolError if it is malformed, ``Gap`` if an earlier datagram is missing.
         """
         try:
             kind, count, number, acknowledged = _HEADER.unpack_from(datagram)
