@@ -331,7 +331,7 @@ class MemoryLink:
         return bool(self._shares)
 
     def flush(self) -> None:
-        """SendMemoryMessage what has changed here, ahead of what is about to be sent."""
+        """Send the changes of this side.  Call it before any other message is sent."""
         for share in self._shares.values():
             self._flush(share)
 
@@ -435,7 +435,7 @@ class _Downstream:
         self._link = link
 
     def joined(self, block: Block) -> None:
-        """SendMemoryMessage it on."""
+        """Send the contents to the other side."""
         self._link.accepted(self)
 
     def refused(self, reason: str) -> None:
