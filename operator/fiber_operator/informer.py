@@ -257,16 +257,19 @@ class _Reflector:
 
     def _keep(self, document: Body) -> None:
         metadata = mapping(document, "metadata")
+        uid, version = text(metadata.get("uid")), text(metadata.get("resourceVersion"))
+        before = self._pods.get(uid)
+        if before is not None and version and before.view.resource_version == version:
+            return  # the answer to a creation, and the event of the same creation
         labels = mapping(metadata, "labels")
         view = observe(document, worker_container(document))
-        if view.uid in self._ending:
+        if uid in self._ending:
             view = _as_ending(view)
         key = Key(text(metadata.get("namespace")), text(labels.get(names.LABEL_POOL)))
         known = _Known(key, text(labels.get(names.LABEL_POOL_UID)), view)
-        before = self._pods.get(view.uid)
         if before is not None and before.pool != known.pool:
-            self._drop(view.uid)
-        self._put(view.uid, known)
+            self._drop(uid)
+        self._put(uid, known)
         if before is None or not _same(before.view, view):
             self._changed(key)
 
