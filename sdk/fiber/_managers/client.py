@@ -48,7 +48,7 @@ TAKE_BACK = "take_back"
 """Method of the server: undo the last call of a channel, whose caller was interrupted."""
 
 JOIN, OPEN_CHANNEL, INCREF, DECREF, LEAVE = "join", "line", "incref", "decref", "bye"
-"""First words of the notices to a server."""
+"""First words of the notices to a server.  The values are part of the wire format."""
 
 _LOOK_AGAIN = 0.5
 """Seconds between checks that the server is alive, while it has not taken a new channel."""
