@@ -81,7 +81,7 @@ KILLED = {"exitCode": 137, "reason": "OOMKilled"}
         ),
         (
             pod(terminated={"exitCode": 137, "reason": "ContainerStatusUnknown"}),
-            "NodeLost: its node lost sight of it",
+            "NodeLost: its node has no record of the container",
             None,
         ),
         (pod(deleted=True), "Deleted: somebody deleted the pod", None),

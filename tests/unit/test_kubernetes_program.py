@@ -42,9 +42,9 @@ def test_the_reason_why_the_own_pod_is_not_found(rig: Rig, name: str, why: str) 
 
 
 def test_variables_that_stay_behind_are_named(capsys: pytest.CaptureFixture[str]) -> None:
-    provisioner._say_what_stays_behind([])
+    provisioner._report_withheld_variables([])
     assert capsys.readouterr().err == ""
-    provisioner._say_what_stays_behind(["API_KEY", "TOKEN"])
+    provisioner._report_withheld_variables(["API_KEY", "TOKEN"])
     assert "API_KEY, TOKEN" in capsys.readouterr().err
 
 

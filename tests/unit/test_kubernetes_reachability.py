@@ -146,7 +146,7 @@ def test_pods_that_may_serve_another_program_are_waited_for() -> None:
     site.loop.run_for(ERROR_AT + 1)
     (doubt,) = site.told
     assert doubt.endswith(
-        "Or the pods still serve laptop-8:4712, which had this pool before and "
+        "Or the pods still serve laptop-8:4712, the master before, which "
         "does not renew its Lease: end that program"
     )
     assert site.report is None

@@ -302,7 +302,7 @@ def test_one_that_was_deleted_is_not_begun_anew(rig: Rig, told: Told) -> None:
     rig.remove(names.PLURAL, "warm")
     error = told.error()
     assert error.reason == "Deleted"
-    assert "whoever keeps it has to make it again" in str(error)
+    assert "Its owner has to make it again" in str(error)
     assert "begins anew" not in str(error)
 
 

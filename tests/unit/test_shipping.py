@@ -191,7 +191,7 @@ def test_a_session_in_a_folder_that_is_too_large_goes_on_with_what_it_imported(s
     assert (done.returncode, done.stdout) == (0, "program True\n")
     assert done.stderr.count("RuntimeWarning") == 1
     assert f"{site.program}/large.npy" in done.stderr
-    assert "only what was imported from it" in done.stderr
+    assert "only imported modules of the working directory" in done.stderr
 
 
 def test_a_script_in_a_home_directory_goes_on_with_what_it_imported(
@@ -216,7 +216,7 @@ if __name__ == "__main__":
     done = site.run(program=program)
     assert done.stdout.splitlines() == ["['elsewhere.py', 'helper.py', 'main.py']"] * 2
     assert done.stderr.count("RuntimeWarning: the program is in") == 1
-    assert "Put it into a folder of its own" in done.stderr
+    assert "Move the program to a separate folder" in done.stderr
 
 
 def test_secrets_and_links_that_are_left_out_are_said_once(site: Site, tmp_path: Path) -> None:

@@ -40,7 +40,7 @@ from fiber.config import Config
 from fiber.errors import StartError
 
 _REASONS = 3
-"""Failed agents that an error lists."""
+"""Number of failed agents that an error lists."""
 
 _EXPECTED_FOR = 5.0
 """Seconds from an agent's start for which the others leave it its share of the children."""
@@ -55,12 +55,12 @@ _QUIT_TIMEOUT = 5.0
 
 
 class LoopbackBackend:
-    """Starts its agents at once and replaces each at the moment it is lost.
+    """Backend that starts its agents at once, and replaces each as soon as it is lost.
 
-    After agents that did not join, one has to succeed before others are started.  When that takes
-    too long, the children that wait are refused, and from then on each new child is one more try.
+    After failures to join, one agent has to succeed before others are started.  When that takes too
+    long, the waiting children are refused, and from then on each new child causes one more attempt.
 
-    Only the loop's thread changes what it holds; others read it, without a lock.
+    Only the loop's thread changes the attributes; other threads read them without a lock.
     """
 
     name = "loopback"
@@ -86,7 +86,7 @@ class LoopbackBackend:
         self._slots: list[_Slot] = []
         self._by_name: dict[str, _Slot] = {}
         self._departing: dict[str, _Slot] = {}
-        """Slots whose agents are about to go, and were replaced."""
+        """Slots whose agents are leaving and were replaced."""
         self._vacant: list[_Slot] = []
         """Slots whose agents are lost and not replaced yet."""
         self.agents = AgentSet(
@@ -119,11 +119,11 @@ class LoopbackBackend:
 
     @property
     def sends_program(self) -> bool:
-        """True if its agents need the program's files."""
+        """True if the agents need the program's files."""
         return self.elsewhere is not None
 
     def child(self, spec: ChildSpec, observer: ChildObserver) -> RemoteChild:
-        """A child for the agent with the fewest; StartError if none can take one more."""
+        """Return a child, not started yet; StartError if all agents are full."""
         agents = len(self._slots)
         if self.agents.children >= agents * self._limit:
             raise StartError(
@@ -147,7 +147,7 @@ class LoopbackBackend:
         self._output.close()
 
     def _launch(self, index: int) -> None:
-        # A name is never used again: what comes late from its last holder is not for the next.
+        # A name is never used again, so late messages of an agent never count for the next one.
         name = f"loopback-{next(self._numbers)}"
         files = self._files(name)
         process = AgentProcess(self._loop, partial(self._ended, name), files, self.elsewhere)
@@ -182,7 +182,7 @@ class LoopbackBackend:
             "FIBER_START_TIMEOUT": str(self._config.start_timeout),
         }
 
-    # On the loop's thread
+    # Events, on the loop's thread
 
     def _objection(self, identity: Identity) -> str:
         slot = self._by_name.get(identity.name)
@@ -199,7 +199,7 @@ class LoopbackBackend:
         self._fill_vacant()
 
     def _refused(self, reason: str) -> None:
-        if not self._closing:  # else it may be one of ours, ended before it was in
+        if not self._closing:  # else it may be an agent that was ended before it joined
             self._output.write("fiber", f"refused an agent: {reason}")
 
     def _unserved(self, name: str, reason: str) -> None:
@@ -276,7 +276,7 @@ class LoopbackBackend:
         self._expect()
 
     def _expect(self) -> None:
-        """Have children wait for agents that may join at any moment."""
+        """Let children wait for agents that may join at any moment."""
         due = self._loop.now() - _EXPECTED_FOR
         late = [slot for slot in self._starting if slot.launched <= due]
         expected = 0 if self._failures.count else len(self._starting) - len(late)
@@ -307,7 +307,7 @@ class LoopbackBackend:
 
 
 class _Slot(NamedTuple):
-    """The place of an agent among the others, its name, its process, and the time of its start."""
+    """Place for an agent, with the agent's name, process and start time."""
 
     position: int
     name: str
@@ -351,7 +351,7 @@ _PAUSE_MIN, _PAUSE_MAX = 0.1, 5.0
 """Seconds from one attempt to start a process to the next, growing."""
 
 _MAY_PASS = (errno.EAGAIN, errno.ENOMEM, errno.EMFILE, errno.ENFILE)
-"""Errors of a system that can start no process until others have ended."""
+"""Errors that pass when other processes have ended."""
 
 _STATEMENT = "import runpy; runpy.run_module('fiber.agent', run_name='__main__')"
 
@@ -359,8 +359,8 @@ _STATEMENT = "import runpy; runpy.run_module('fiber.agent', run_name='__main__')
 class AgentProcess:
     """Process of an agent, from before its start to after its end.
 
-    ``on_end`` is called once, on the loop's thread: with how the process ended or why it never
-    began, and whether a signal or a lack of resources was the reason.
+    ``on_end`` is called once, on the loop's thread.  It gets the reason why the process ended or
+    never began, and whether a signal or a lack of resources caused that.
     """
 
     def __init__(
@@ -381,11 +381,11 @@ class AgentProcess:
 
     @property
     def pid(self) -> int | None:
-        """Id of the process, once it has begun."""
+        """Id of the process; None before its start."""
         return None if self._process is None else self._process.pid
 
     def start(self, environment: Mapping[str, str], credentials: Credentials) -> None:
-        """Start it, with the credentials on a descriptor that only it inherits; or OSError."""
+        """Start the process, which alone inherits the descriptor of the credentials; OSError."""
         with self._lock:
             if self._unwanted:
                 return
@@ -403,7 +403,7 @@ class AgentProcess:
                 os.close(descriptor)
             try:
                 self._watched = os.pidfd_open(process.pid)
-            except OSError:  # nobody would see its end, and the next attempt has its name
+            except OSError:  # its end would stay unseen, and the next attempt has its name
                 process.kill()
                 process.wait()
                 raise
@@ -419,7 +419,7 @@ class AgentProcess:
         self._end(signal.SIGKILL)
 
     def terminate(self) -> None:
-        """Tell the agent to end.  It removes its directory first."""
+        """Send SIGTERM to the agent, which removes its directory before it ends."""
         self._end(signal.SIGTERM)
 
     def _end(self, signum: int) -> None:
@@ -430,7 +430,7 @@ class AgentProcess:
                     self._process.send_signal(signum)
 
     def wait(self, timeout: float) -> None:
-        """Wait for its end, by force after ``timeout`` seconds.  It must not be started later."""
+        """Wait for the end; kill the process after ``timeout`` seconds."""
         process = self._process
         if process is None:
             return
@@ -455,10 +455,10 @@ class AgentProcess:
 
 
 class AgentLauncher:
-    """A thread that starts agents, one after the other.
+    """Thread that starts agents, one after the other.
 
-    Starting a process takes milliseconds and may fail, so the loop does not do it; nor would a
-    thread of its own for each be there when the system has no more of them to give.
+    Starting a process takes milliseconds and may fail, so the loop does not do it.  A thread for
+    each agent could be refused when the system is short of threads.
     """
 
     def __init__(self, timeout: float, on_trouble: Callable[[str], None]) -> None:
@@ -476,11 +476,11 @@ class AgentLauncher:
     def launch(
         self, process: AgentProcess, credentials: Credentials, environment: Mapping[str, str]
     ) -> None:
-        """Start it as soon as possible.  Any thread; returns at once."""
+        """Start a process as soon as possible; return at once.  Any thread."""
         self._wanted.put((process, credentials, environment))
 
     def close(self) -> None:
-        """Start nothing more."""
+        """Start no more processes."""
         self._closing.set()
         self._wanted.put(None)
         self._thread.join()

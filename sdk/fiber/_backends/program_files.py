@@ -26,19 +26,19 @@ LIMIT = 100 << 20
 MOST_FILES = 50_000
 
 _LARGEST = 5
-"""Entries that an error lists."""
+"""Number of entries that an error lists."""
 
 
 class FileEntry(NamedTuple):
     """File, folder or link, as it was found."""
 
     path: str
-    """Path on this host.  The contents are read from there, through a link if need be."""
+    """Path on this host, from which the contents are read, also through a link."""
     mode: int
     size: int = 0
     modified: int = 0
     target: str | None = None
-    """Target of a link within the folder.  For other links their target is sent in their place."""
+    """Target of a link within the folder; other links are replaced by their targets."""
 
 
 class Why(enum.Enum):
@@ -67,7 +67,7 @@ class Selection(NamedTuple):
 
 
 def select(layout: Layout, *, bounded: bool = True) -> Selection:
-    """Return what is sent of the program; ProgramTooLarge if that is too much and ``bounded``."""
+    """Return the files to send; ProgramTooLarge if they are too many and ``bounded``."""
     found: dict[str, FileEntry] = {}
     name_of = layout.places.name_of
     walk = _Walk(layout)
@@ -80,7 +80,7 @@ def select(layout: Layout, *, bounded: bool = True) -> Selection:
                 raise too_large(layout, found, f"more than {MOST_FILES:,} files")
     if bounded:
         _check_size(layout, found)
-    if layout.paths.directory:  # children work in it, even if none of it is sent
+    if layout.paths.directory:  # the working directory must exist, also if it is empty
         found.setdefault(layout.paths.directory, FileEntry("", stat.S_IFDIR))
     sent = {entry.path for entry in found.values()}
     return Selection(found, tuple(left for left in walk.left_out if left.path not in sent))
@@ -104,17 +104,17 @@ def too_large(layout: Layout, found: dict[str, FileEntry], what: str) -> Program
 
 
 def mebibytes(size: int) -> str:
-    """Return a size for people."""
+    """Return a size in MiB, as text."""
     return f"{size / (1 << 20):.1f} MiB"
 
 
 class _Around(NamedTuple):
-    """The way to a folder."""
+    """Path of real folders to a folder."""
 
     folders: tuple[str, ...]
-    """The real folders that it was come to through, and itself."""
+    """Real folders on the path, the last one included."""
     top: str
-    """The real folder that links may lead to: the first, or where a link has led."""
+    """Real folder that links may lead to: the first one, or the target of a link."""
     trusted: bool = False
     """True if an ignore file asks for a folder of secrets around this one."""
 
@@ -132,7 +132,7 @@ class _Walk:
         """Folders with modules that the program has imported."""
 
     def everything_in(self, top: str) -> Iterator[tuple[str, FileEntry]]:
-        """``top`` itself and, if it is a folder, what the rules leave of it."""
+        """Yield ``top`` and, if it is a folder, the entries in it that the rules select."""
         entry = _entry(top)
         if entry is None:
             return
@@ -164,7 +164,7 @@ class _Walk:
                 self.left_out.append(left_out)
             elif not is_folder:
                 yield path, entry
-            elif real not in around.folders:  # or a link leads back to where we came from
+            elif real not in around.folders:  # else a link leads back to an outer folder
                 yield path, entry
                 trusted = around.trusted or secret_in_folder(found.name) is not None
                 yield from self._walk(path, rules, around.within(real, trusted))
@@ -172,7 +172,7 @@ class _Walk:
     def _objection(
         self, entry: FileEntry, real: str, rules: IgnoreRules, around: _Around
     ) -> UnsentFile | None:
-        """Why the entry of a folder is left out."""
+        """Return why an entry is left out; None if it is sent."""
         path, is_folder = entry.path, stat.S_ISDIR(entry.mode)
         ignored = rules.ignores(path, is_folder=is_folder)
         if ignored is not None:
@@ -195,7 +195,7 @@ def _found_in(folder: str) -> list[os.DirEntry[str]]:
 
 
 def _is_readable(entry: FileEntry) -> bool:
-    """Tell whether this program can read the file, or list and enter the folder."""
+    """Return whether this program can read the file, or list and enter the folder."""
     if entry.target is not None:
         return True
     needed = os.R_OK | os.X_OK if stat.S_ISDIR(entry.mode) else os.R_OK
@@ -203,7 +203,7 @@ def _is_readable(entry: FileEntry) -> bool:
 
 
 def _secret(entry: FileEntry, real: str) -> str | None:
-    """Return the kind of secret, if the name of the entry or of its target is that of one."""
+    """Return the kind of secret that the entry or its target is; None if it is none."""
     if stat.S_ISDIR(entry.mode):
         names = map(os.path.basename, (entry.path, real))
         return next(filter(None, map(secret_in_folder, names)), None)
@@ -215,7 +215,7 @@ def _secret(entry: FileEntry, real: str) -> str | None:
 
 
 def _link(path: str, real: str, around: _Around) -> FileEntry | None:
-    """A link as it is, if it stays within the folder, otherwise what it leads to."""
+    """Return the link itself if it stays within the folder, otherwise its target."""
     first, parent = around.folders[0], around.folders[-1]
     inside = all(_is_inside(place, first) for place in (*around.folders, real))
     if inside and os.path.exists(path):
@@ -228,7 +228,7 @@ def _is_inside(path: str, folder: str) -> bool:
 
 
 def _entry(path: str) -> FileEntry | None:
-    """A file or folder; None for anything else, and for what is gone."""
+    """Return the file or folder at ``path``; None for others and for missing ones."""
     try:
         found = os.stat(path)
     except OSError:
@@ -337,14 +337,14 @@ _PATHS = {
     "/.mlflow/credentials": "passwords of MLflow",
     "/.snowsql/config": "passwords of databases",
 }
-"""Ends of paths, in lower case, of files whose names alone say little."""
+"""Ends of paths, in lower case, of files whose names alone are too common."""
 
 _EXAMPLES = (".env.example", ".env.sample", ".env.template", ".env.dist")
 
 _COPY = re.compile(
     r"#(?P<emacs>.+)#|\.(?P<vim>.+)\.sw[op]|(?P<copy>.+?)(?:~|\.(?:bak|old|orig|save))"
 )
-"""A name of a copy that an editor or a person keeps beside the file."""
+"""Names of copies that editors or people keep beside a file."""
 
 _CONTENTS = {
     "a private key": (
@@ -379,8 +379,8 @@ _CONTENTS = {
     "a key of Anthropic": (rb"sk-ant-[a-z]+[0-9]{2}-[\w-]{80}",),
     "a key of OpenAI": (rb"sk-[\w-]{20,}T3BlbkFJ[\w-]{20}",),
 }
-"""Expressions that are found in contents of each kind.  One that begins with fixed letters is found
-fastest, so what must not precede them comes after.
+"""Expressions that all match in the contents of each kind.  An expression that begins with fixed
+letters is found fastest, so the condition about letters before them stands after them.
 """
 
 _CODE = (".py", ".pyi", ".pyx", ".so")
@@ -402,14 +402,14 @@ _ANY_NAME = _compiled(tuple(pattern for patterns in _FILES.values() for pattern 
 
 
 def secret_in_folder(name: str) -> str | None:
-    """Return what a folder of this name holds, if that is secret."""
+    """Return the kind of secrets in a folder of this name; None if there are none."""
     return _FOLDERS.get(name.lower())
 
 
 def secret_in_file(path: str, size: int, modified: int) -> str | None:
-    """Return what the file holds, if that is secret.
+    """Return the kind of secret in the file; None if there is none.
 
-    ``size`` and ``modified`` say which state of the file is meant: each is read once.
+    Each state of a file, by its ``size`` and ``modified``, is read once.
     """
     name = os.path.basename(path).lower()
     if name.endswith(_CODE):
@@ -445,12 +445,12 @@ def _by_contents(path: str, size: int, modified: int) -> str:
     The head of a file shows secrets.  Only all of a ``*.pem`` file shows that it has none.
     """
     try:
-        # A pipe in its place meanwhile must not be waited for.
+        # Do not wait if a pipe has replaced the file.
         with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
             limit = _SMALL if path.lower().endswith(".pem") else _HEAD
             head = file.read(limit) or b""  # None: a pipe with nothing in it
     except OSError:
-        return ""  # what cannot be read is not sent
+        return ""  # an unreadable file is not sent
     for holds, needed in _BY_CONTENTS.items():
         if all(pattern.search(head) for pattern in needed):
             return holds

@@ -38,55 +38,55 @@ from fiber._agent.child import ProgramPaths
 _INSTALLED = frozenset({"site-packages", "dist-packages"})
 
 LOOSE = "program"
-"""The folder there for what is sent without the folder that it is in here."""
+"""Folder on the other machine for modules that are sent without the folder around them."""
 
 
 class Places(dict[str, str]):
-    """Folders and files here, none of them in another, and what each is called there."""
+    """Local folders and files, none within another, and their names on the other machine."""
 
     def place_of(self, path: str) -> str | None:
-        """The place that ``path`` is, or is in."""
+        """Return the place that is ``path`` or has it; None if there is none."""
         return next((place for place in self if _is_inside(path, place)), None)
 
     def name_of(self, path: str) -> str | None:
-        """Return the path there; None if ``path`` is not sent."""
+        """Return the path on the other machine; None if ``path`` is not sent."""
         place = self.place_of(path)
         return None if place is None else self[place] + path[len(place) :]
 
 
 class Layout(NamedTuple):
-    """Folders and files to send, and their places there."""
+    """Folders and files to send, and their places on the other machine."""
 
     places: Places
     program: str
-    """The program's folder; of some only a part is sent."""
+    """Folder of the program, of which only a part may be sent."""
     files: tuple[str, ...]
-    """Files that were imported from the places.  Children need them, even ignored ones."""
+    """Files that were imported from the places.  They are sent in spite of ignore files."""
     trees: tuple[str, ...]
-    """Folders of ``sys.path`` of which only these files are sent."""
+    """Folders of ``sys.path`` of which only imported files are sent."""
     session: frozenset[str]
     """Places that are only the working directory of a session."""
     paths: ProgramPaths
 
 
 class _ImportedModule(NamedTuple):
-    """A module that has been imported."""
+    """Module that has been imported."""
 
     file: str
     whole: str
-    """The file, or the folder of the package that it is in."""
+    """The file, or the folder of its package."""
     name: str
-    """Name that the main module must have to be imported."""
+    """Name of the place, so that the module can be imported from it."""
 
 
 def find_layout(preparation: Mapping[str, Any], left_out: frozenset[str]) -> Layout:
-    """The layout of this program, whose children are prepared by ``preparation``.
+    """Return the layout of this program, whose children are prepared by ``preparation``.
 
-    Of the folders ``left_out`` only what has been imported is sent.
+    Of the folders ``left_out`` only imported modules are sent.
     """
     main, here = main_file(), os.path.abspath(preparation["dir"])
     program = here if main is None else _folder_of(main)
-    # One that has a name is imported by that, and a package's not at all: importing it runs it.
+    # Other main modules are imported by their names, or not at all (a package's __main__).
     by_path = "init_main_from_path" in preparation
     path = list(map(os.path.abspath, preparation["sys_path"]))
     whole = (folder for folder in (program, *path) if folder == program or _is_offered(folder))
@@ -113,7 +113,7 @@ def find_layout(preparation: Mapping[str, Any], left_out: frozenset[str]) -> Lay
 
 
 def main_file() -> str | None:
-    """The file of the main module, if that is the program's own and not installed."""
+    """Return the file of the main module; None if it is installed or has no file."""
     path = getattr(sys.modules["__main__"], "__file__", None)
     if path is None:
         return None
@@ -127,7 +127,7 @@ def _started_in() -> str:
 
 
 def _session(here: str) -> frozenset[str]:
-    # An interactive interpreter has the directory that it was started in on its path.
+    # An interactive interpreter has its first working directory on its path.
     return frozenset({here, os.path.abspath(_started_in())})
 
 
@@ -140,7 +140,7 @@ def _folder_of(main: str) -> str:
 
 
 def _search_path(places: Places, path: list[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the entries of ``sys.path`` there, before and after the standard library."""
+    """Return the entries of the other machine's ``sys.path``, before and after the library."""
 
     def there(entries: list[str]) -> list[str]:
         names = [places.name_of(entry) for entry in entries if not _is_installed(entry)]
@@ -163,7 +163,7 @@ def _is_tree(folder: str, places: Places) -> bool:
 
 
 def _is_sent(path: str) -> bool:
-    return os.path.exists(path) and not (_is_installed(path) or _is_nobodys(path))
+    return os.path.exists(path) and not (_is_installed(path) or _is_shared(path))
 
 
 def _is_installed(path: str) -> bool:
@@ -180,8 +180,8 @@ def _own_folders() -> frozenset[str]:
     return frozenset({fiber, *map(sysconfig.get_path, kinds)})
 
 
-def _is_nobodys(folder: str) -> bool:
-    """Tell whether the folder holds all kinds of things, as a home folder does."""
+def _is_shared(folder: str) -> bool:
+    """Return whether the folder has unrelated files, as a home folder does."""
     home, here = os.path.realpath(os.path.expanduser("~")), os.path.realpath(folder)
     return _is_inside(home, here) or here == os.path.realpath(tempfile.gettempdir())
 
@@ -191,7 +191,7 @@ def _is_inside(path: str, folder: str) -> bool:
 
 
 def _outermost(paths: Iterable[str]) -> list[str]:
-    """Each path once, and none that is in another."""
+    """Return each path once, without those within another."""
     found = list(dict.fromkeys(paths))
     return [
         path
@@ -214,10 +214,10 @@ def _named(paths: Iterable[str]) -> dict[str, str]:
 
 
 def _imported(left_out: frozenset[str]) -> Iterator[_ImportedModule]:
-    """The modules that are not installed; parts of packages, too."""
+    """Yield the imported modules that are not installed, including parts of packages."""
     for name, module in list(sys.modules.items()):
         if name in ("__main__", "__mp_main__") or name.partition(".")[0] == "fiber_api":
-            continue  # the second package of Fiber lies beside the first
+            continue  # a part of Fiber
         file = getattr(module, "__dict__", {}).get("__file__")
         if not isinstance(file, str) or _is_installed(file) or not os.path.isfile(file):
             continue
@@ -227,31 +227,31 @@ def _imported(left_out: frozenset[str]) -> Iterator[_ImportedModule]:
             yield _ImportedModule(file, next(iter(top.__path__)), package)
         elif portion := _portion(top, file, left_out):
             yield _ImportedModule(file, portion, package)
-        else:  # of a namespace package, whose folder may be anything
+        else:  # of a namespace package, whose folder may have unrelated files
             if not hasattr(module, "__path__"):
                 parts.pop()
             yield _ImportedModule(file, file, os.path.join(*parts, os.path.basename(file)))
 
 
 def _portion(package: Any, file: str, left_out: frozenset[str]) -> str | None:
-    """The folder of a namespace package that ``file`` is in, if only that package is there."""
+    """Return the folder of a namespace package with ``file``; None if it may have others."""
     folders = (os.path.abspath(folder) for folder in getattr(package, "__path__", ()))
     folder = next((folder for folder in folders if _is_inside(file, folder)), None)
     if folder is None:
         return None
     around = os.path.dirname(folder)
-    return None if around in left_out or _is_nobodys(around) else folder
+    return None if around in left_out or _is_shared(around) else folder
 
 
 INCLUDING = ".fiberignore"
-"""The file that says what is sent of a folder, although it would not be."""
+"""File by which a folder is sent, and by which ignored files in it are sent."""
 
 _FILES = (".gitignore", INCLUDING)
 
 _REPOSITORIES = (".git", ".hg", ".svn")
 
 BYTECODE = "__pycache__"
-"""The folder that Python keeps compiled modules in."""
+"""Folder in which Python keeps compiled modules."""
 
 _NEVER_NEEDED = f"""
 .git
@@ -268,7 +268,7 @@ _NEVER_NEEDED = f"""
 node_modules/
 .DS_Store
 """
-"""Files that tools and editors leave.  An ignore file with ``!name`` has them sent."""
+"""Files that tools and editors leave.  A line ``!name`` of an ignore file sends them."""
 
 
 class _Level(NamedTuple):
@@ -277,7 +277,7 @@ class _Level(NamedTuple):
     patterns: GitIgnoreSpec
 
     def decide(self, path: str) -> _Decision | None:
-        # No pattern has a line break, and none of pathspec's expressions gets past one.
+        # No pattern has a line break, and pathspec's expressions do not match one.
         found = self.patterns.check_file(path[len(self.folder) + 1 :].replace("\n", "\0"))
         if found.include is None or found.index is None:
             return None
@@ -285,30 +285,30 @@ class _Level(NamedTuple):
 
 
 class _Decision(NamedTuple):
-    """Line of an ignore file that decides about a path."""
+    """Line of an ignore file that applies to a path."""
 
     ignored: bool
     line: str
     level: _Level
 
     def names(self, path: str) -> bool:
-        """Return whether the line has the path's own name, and not that of a folder around it."""
+        """Return whether the line names the path itself, and not a folder around it."""
         last = self.line.strip().rstrip("/").rpartition("/")[2].removeprefix("!")
         name = os.path.basename(path.rstrip("/"))
         return bool(last.strip("*")) and fnmatch.fnmatchcase(name, last)
 
 
 class IgnoreRules:
-    """The rules that hold in one folder."""
+    """Ignore rules of one folder."""
 
     def __init__(self, levels: tuple[_Level, ...]) -> None:
         self._levels = levels
 
     @classmethod
     def around(cls, folder: str) -> IgnoreRules:
-        """Return the rules that ``folder`` has from the folders around it.
+        """Return the rules for ``folder`` from the folders around it.
 
-        None if they say to ignore that very folder: they were not made for what is run from it.
+        If they ignore the folder itself, there are no rules: they do not fit a program in it.
         """
         rules = cls(())
         for outer in _up_to_repository(folder):
@@ -319,13 +319,13 @@ class IgnoreRules:
         return rules
 
     def within(self, folder: str) -> IgnoreRules:
-        """Return the rules that hold in ``folder``, below the folder of these rules."""
+        """Return the rules of ``folder``, below the folder of these rules."""
         top = folder.rstrip(os.sep)
         found = [_Level(top, name, _compiled(text)) for name, text in _read_all(folder)]
         return IgnoreRules((*self._levels, *found)) if found else self
 
     def ignores(self, path: str, *, is_folder: bool) -> str | None:
-        """Return why ``path``, in the folder, is not needed; None if it may be."""
+        """Return why ``path``, in the folder, is ignored; None if it is not."""
         if is_folder and os.path.isfile(os.path.join(path, "pyvenv.cfg")):
             return "a virtual environment, whose packages belong into the image"
         path += "/" if is_folder else ""
@@ -339,7 +339,7 @@ class IgnoreRules:
         return "left by a tool" if tool else None
 
     def asks_for(self, path: str, *, is_folder: bool) -> bool:
-        """Return whether a line of ``.fiberignore`` has ``path`` sent, by its name: ``!name``."""
+        """Return whether a line ``!name`` of ``.fiberignore`` names ``path``, so it is sent."""
         path += "/" if is_folder else ""
         for level in reversed(self._levels):
             decision = level.decide(path) if level.name == INCLUDING else None
@@ -349,7 +349,7 @@ class IgnoreRules:
 
 
 def _up_to_repository(folder: str) -> list[str]:
-    """The folders around ``folder`` in its repository, the outermost first; none without one."""
+    """Return the folders around ``folder`` in its repository, the outermost first."""
     around: list[str] = []
     here = folder
     while not any(os.path.exists(os.path.join(here, name)) for name in _REPOSITORIES):
@@ -367,7 +367,7 @@ def _read_all(folder: str) -> Iterable[tuple[str, str]]:
             path = os.path.join(folder, name)
             with open(path, encoding="utf-8-sig", errors="surrogateescape") as file:
                 yield name, file.read()
-        except OSError:  # there is none, or nobody may read it: git goes on, too
+        except OSError:  # missing or unreadable; git ignores it too
             continue
 
 
@@ -380,6 +380,6 @@ def _compiled(text: str) -> GitIgnoreSpec:
 def _is_pattern(line: str) -> bool:
     try:
         GitIgnoreSpecPattern(line)
-    except GitIgnorePatternError:  # git takes no notice of it
+    except GitIgnorePatternError:  # git ignores the line
         return False
     return True

@@ -1,4 +1,4 @@
-"""Sending the program to agents that do not have its file system.
+"""Archive of the program for agents that do not share its file system.
 
 The files go into one archive. The same files give the same bytes, so each agent receives an archive
 once.
@@ -26,24 +26,24 @@ from fiber._wire.memory_files import Blob
 from fiber.errors import ProgramTooLarge, in_one_line
 
 _SHOWN = 10
-"""Entries that a warning lists."""
+"""Number of entries that a warning lists."""
 
 
 class PackedProgram(NamedTuple):
-    """The program's files, as they were when they were looked at last."""
+    """Archive of the program's files, and their paths in it."""
 
     archive: Blob
     paths: ProgramPaths
 
 
 class Shipping:
-    """Files of this program to send.  Any thread may look."""
+    """Packer of this program's files, which warns of files that are not sent.  Any thread."""
 
     def __init__(self) -> None:
         self._latest: tuple[dict[str, FileEntry], PackedProgram] | None = None
         self._left_out: frozenset[str] = frozenset()
-        self._said: set[str] = set()
-        """Warnings, and the paths that were in one."""
+        self._warned: set[str] = set()
+        """Warnings that were given, and the paths in them."""
 
     @property
     def main_is_sent(self) -> bool:
@@ -51,25 +51,25 @@ class Shipping:
         return main_file() is not None
 
     def program(self, preparation: Mapping[str, Any], *, anew: bool) -> PackedProgram:
-        """The program for children that ``preparation`` is for; ProgramTooLarge.
+        """Return the program for children that are prepared by ``preparation``; ProgramTooLarge.
 
-        ``anew``: as its files are now, not as they were for the last child.
+        ``anew``: pack the present files, not those that were packed for the last child.
         """
         if self._latest is None or anew:
-            self._latest = self._look(preparation)
+            self._latest = self._pack(preparation)
         return self._latest[1]
 
-    def _look(self, preparation: Mapping[str, Any]) -> tuple[dict[str, FileEntry], PackedProgram]:
+    def _pack(self, preparation: Mapping[str, Any]) -> tuple[dict[str, FileEntry], PackedProgram]:
         layout = find_layout(preparation, self._left_out)
         if self.main_is_sent and layout.places.place_of(layout.program) is None:
             self._warn(
-                f"the program is in {layout.program!r}, where its user has all kinds of files: "
-                "workers on other machines get of them only what it has imported. Put it into a "
-                "folder of its own."
+                f"the program is in {layout.program!r}, a folder with unrelated files: workers on "
+                "other machines get only the modules that it has imported. Move the program to a "
+                "separate folder to send its other files."
             )
         try:
             files, left_out = select(layout)
-            self._tell(layout, left_out)
+            self._warn_of_left_out(layout, left_out)
             latest = self._latest
             if latest is not None and latest[0] == files:
                 return files, latest[1]._replace(paths=layout.paths)
@@ -79,20 +79,19 @@ class Shipping:
                 raise
             self._left_out |= layout.session
             self._warn(
-                f"{error} Until then workers have of the working directory only what was imported "
-                "from it."
+                f"{error} Until then workers get only imported modules of the working directory."
             )
-            return self._look(preparation)
-        self._tell_torn(packed.torn)
+            return self._pack(preparation)
+        self._warn_of_torn(packed.torn)
         archive = Blob(packed.archive)
         if latest is not None and latest[1].archive.digest == archive.digest:
-            archive = latest[1].archive  # touched, and the same
+            archive = latest[1].archive  # new times, same contents
         return files, PackedProgram(archive, layout.paths)
 
-    def _tell(self, layout: Layout, left_out: Iterable[UnsentFile]) -> None:
-        """Say once of each path that a person would not expect it to be left out."""
-        news = [left for left in left_out if left.path not in self._said]
-        self._said.update(left.path for left in news)
+    def _warn_of_left_out(self, layout: Layout, left_out: Iterable[UnsentFile]) -> None:
+        """Warn once of each path that is left out unexpectedly."""
+        news = [left for left in left_out if left.path not in self._warned]
+        self._warned.update(left.path for left in news)
         for why, sentence in _SENTENCES.items():
             entries = [left for left in news if left.why is why]
             if entries:
@@ -101,16 +100,16 @@ class Shipping:
                 shown += [more] * (len(entries) > _SHOWN)
                 self._warn("\n".join((sentence, *shown, _advice(layout, entries[0].path))))
 
-    def _tell_torn(self, torn: list[str]) -> None:
-        """Say once of each file that it changed each time that it was read."""
-        news = [path for path in torn if path not in self._said]
-        self._said.update(news)
+    def _warn_of_torn(self, torn: list[str]) -> None:
+        """Warn once of each file that changed during each attempt to read it."""
+        news = [path for path in torn if path not in self._warned]
+        self._warned.update(news)
         if news:
             self._warn("\n".join((_TORN, *_shown(news))))
 
     def _warn(self, message: str) -> None:
-        if message not in self._said:
-            self._said.add(message)
+        if message not in self._warned:
+            self._warned.add(message)
             warnings.warn(message, RuntimeWarning, stacklevel=2)
 
 
@@ -134,7 +133,7 @@ def _shown(lines: Iterable[str]) -> list[str]:
 def _advice(layout: Layout, path: str) -> str:
     place = layout.places.place_of(path) or os.path.dirname(path)
     rules = os.path.join(place, INCLUDING)
-    # In a line of .fiberignore these would be patterns, the end of the line, or nothing.
+    # These characters have a special meaning in a line of .fiberignore.
     name = re.sub(r"[^\w./@+~:,%= -]| $", "?", path[len(place) :])
     return (
         f"To send one that workers need, write a line with its name into {rules}, "
@@ -143,18 +142,18 @@ def _advice(layout: Layout, path: str) -> str:
 
 
 _ATTEMPTS = 3
-"""Times to read a file that changes meanwhile."""
+"""Attempts to read a file that changes meanwhile."""
 
 
 class Packed(NamedTuple):
-    """An archive, and the paths of files that may be in it half written."""
+    """Archive, and the paths of files that it may have half written."""
 
     archive: bytes
     torn: list[str]
 
 
 def pack(layout: Layout, files: dict[str, FileEntry]) -> Packed:
-    """The archive: names in order, no times, no owners.  Reads what is there now."""
+    """Return an archive of the present files: names in order, without times and owners."""
     buffer = io.BytesIO()
     torn: list[str] = []
     with (
@@ -172,7 +171,7 @@ def pack(layout: Layout, files: dict[str, FileEntry]) -> Packed:
 
 
 def _folders_of(names: dict[str, FileEntry]) -> list[str]:
-    """The folders that must be there first, outer ones before inner ones."""
+    """Return all folders of the archive, outer ones before inner ones."""
     folders = {name for name, entry in names.items() if stat.S_ISDIR(entry.mode)}
     for name in names:
         while name := os.path.dirname(name):
@@ -181,7 +180,7 @@ def _folders_of(names: dict[str, FileEntry]) -> list[str]:
 
 
 def _append(archive: tarfile.TarFile, name: str, entry: FileEntry, torn: list[str]) -> int:
-    """Add a file or link; the bytes that it has."""
+    """Add a file or link; return its number of bytes."""
     member = _member(name, entry.mode)
     if entry.target is not None:
         member.linkname = entry.target
@@ -210,7 +209,7 @@ def _read(path: str, torn: list[str]) -> bytes | None:
     data = None
     with contextlib.suppress(OSError):
         for _ in range(_ATTEMPTS):
-            # A pipe in its place meanwhile must not be waited for.
+            # Do not wait if a pipe has replaced the file.
             with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
                 before = os.fstat(file.fileno())
                 if not stat.S_ISREG(before.st_mode):

@@ -8,13 +8,13 @@ program uses.
 Errors::
 
     ApiError
-    ├── Unauthorized  401  it does not know who asks
+    ├── Unauthorized  401  it does not know the login
     ├── Forbidden     403  quota, policy, or no right
     ├── NotFound      404  no such object, namespace or kind
     ├── Conflict      409  the name is taken, or a precondition does not hold
-    ├── Expired       410  a watch that cannot go on from where it was
-    ├── Invalid       the rest of 4xx: asking again will not help
-    └── Transient          perhaps later
+    ├── Expired       410  the version to watch from is forgotten
+    ├── Invalid       the rest of 4xx: repeating will not help
+    └── Transient          repeating may help
         ├── Unreachable      no answer that could be trusted: no connection, too late, nonsense
         ├── ServerError      5xx  it, or what it depends on, has failed
         └── TooManyRequests  429  not now
@@ -47,13 +47,13 @@ if TYPE_CHECKING:
 Body = dict[str, Any]
 
 _LONGEST_RETRY_AFTER = 30.0
-"""Seconds; who asks for more is asked all the same."""
+"""Seconds.  A longer ``Retry-After`` counts as this."""
 
 _MESSAGE_LIMIT = 2000
 
 
 class ApiError(Exception):
-    """A call that did not succeed.  ``reason`` is the API server's word for why, if it gave one."""
+    """Error of a call.  ``reason`` is the API server's word for it; empty if there is none."""
 
     def __init__(self, message: str, *, status: int = 0, reason: str = "") -> None:
         super().__init__(message)
@@ -63,36 +63,36 @@ class ApiError(Exception):
 
 
 class Unauthorized(ApiError):
-    """The API server does not know who asks."""
+    """Error: the API server does not know the login."""
 
 
 class Forbidden(ApiError):
-    """A quota, a policy or a missing right forbids it."""
+    """Error: a quota, a policy or a missing right forbids the call."""
 
 
 class NotFound(ApiError):
-    """No such object, no such namespace or, without a ``reason``, no such kind of object."""
+    """Error: no such object or namespace; without a ``reason``, no such kind of object."""
 
 
 class Conflict(ApiError):
-    """The name is taken, or the object is not the one that was meant."""
+    """Error: the name is taken, or a precondition does not hold."""
 
     repeated = False
-    """True if an earlier attempt of the same call had no answer, and may have taken the name."""
+    """True if an earlier attempt of the same call had no answer, and may have succeeded."""
 
 
 class Expired(ApiError):
-    """The server has forgotten the version that a watch was to go on from.  List anew."""
+    """Error: the server has forgotten the version to watch from.  List again."""
 
 
 class Invalid(ApiError):
-    """The API server cannot accept this, now or later."""
+    """Error: the API server will never accept the call."""
 
 
 class Transient(ApiError):
-    """Not now: asking again may help, no sooner than after ``retry_after`` seconds.
+    """Error that may pass: repeat the call after ``retry_after`` seconds or later.
 
-    It is not known whether the call was carried out.
+    The call may have been carried out.
     """
 
     def __init__(self, message: str, *, retry_after: float = 0.0, **about: Any) -> None:
@@ -101,15 +101,15 @@ class Transient(ApiError):
 
 
 class ServerUnreachable(Transient):
-    """No answer came, or none of an API server."""
+    """Error: no answer came, or none of an API server."""
 
 
 class ServerError(Transient):
-    """The API server, or what it depends on, has failed."""
+    """Error: the API server, or a part that it depends on, has failed."""
 
 
 class TooManyRequests(Transient):
-    """The API server has others to serve."""
+    """Error: the API server is overloaded."""
 
 
 _KINDS: dict[int, type[ApiError]] = {
@@ -124,7 +124,7 @@ _KINDS: dict[int, type[ApiError]] = {
 
 
 def document_of(status: int, headers: Mapping[str, str], data: bytes) -> Body:
-    """The document in an answer; what is no success is raised."""
+    """Return the document in an answer; raise ``ApiError`` if the status is not a success."""
     try:
         body = json.loads(data)
     except (ValueError, RecursionError):
@@ -132,7 +132,7 @@ def document_of(status: int, headers: Mapping[str, str], data: bytes) -> Body:
     if 200 <= status < 300:
         if isinstance(body, dict):
             return body
-        # Not shown: it may be half a Secret.
+        # Not in the message: it may be a part of a Secret.
         raise ServerUnreachable(f"the answer is no JSON object ({len(data)} bytes)", status=status)
     found = body if isinstance(body, dict) else {}
     text = str(found.get("message") or "") or data[:200].decode(errors="replace").strip()
@@ -140,7 +140,7 @@ def document_of(status: int, headers: Mapping[str, str], data: bytes) -> Body:
 
 
 def error_of(status: int, headers: Mapping[str, str], body: Body, text: str = "") -> ApiError:
-    """The error that a Status document, or what came in its place, tells."""
+    """Return the error for a Status document, or for other text in its place."""
     message = (str(body.get("message") or "") or text or f"HTTP status {status}")[:_MESSAGE_LIMIT]
     kind = _kind_of(status)
     about: dict[str, Any] = {"status": status, "reason": str(body.get("reason") or "")}
@@ -156,20 +156,20 @@ def _kind_of(status: int) -> type[ApiError]:
 
 
 def _retry_after(headers: Mapping[str, str], body: Body) -> float:
-    """The header is what counts; in a watch there is only the Status document."""
+    """Return the header's value, or in a watch that of the Status document."""
     text = headers.get("Retry-After") or str((body.get("details") or {}).get("retryAfterSeconds"))
     return min(float(text), _LONGEST_RETRY_AFTER) if text.isdecimal() else 0.0
 
 
 READ_TIMEOUT = 30.0
 TIMEOUT = 30.0
-"""Seconds for one call, all its attempts together, if the caller says nothing else."""
+"""Seconds for one call with all its attempts, by default."""
 
 _PAUSE_MIN, _PAUSE_MAX = 0.1, 5.0
-"""Seconds between two attempts, growing; each is drawn from the upper half."""
+"""Seconds between two attempts, growing; each is random in the upper half."""
 
 _WATCH_SECONDS = 60.0
-"""After so long the API server ends a watch; one that says nothing for twice that was cut off."""
+"""Seconds after which the API server ends a watch; a silence of twice that ends it too."""
 
 _AS_SDK: Mapping[str, str] = {"fieldManager": names.SDK_MANAGER}
 
@@ -180,30 +180,31 @@ class _How(TypedDict, total=False):
 
 
 class Api:
-    """Client of one API server with one login.  Any thread; calls block and raise ``ApiError``.
+    """Client of one API server with one login.
 
-    ``timeout`` bounds a call with all its attempts, in seconds: what may pass (no connection, 429,
-    5xx) is tried again until then, at 0 never.  Setting ``cancel`` ends a pause between attempts.
-    A call that was tried again, or ends in Transient, may have been carried out before.
+    Any thread may call it.  Calls block and raise ``ApiError``.  ``timeout`` bounds a call with all
+    its attempts, in seconds.  Errors that may pass (no connection, 429, 5xx) are tried again until
+    then; at 0 never.  Setting ``cancel`` ends a pause between attempts.  A call that was repeated,
+    or raises Transient, may have been carried out.
     """
 
     def __init__(self, session: ApiSession) -> None:
         self._session = session
         self.trouble: str | None = None
-        """Why the newest call is tried again, or was given up; None once one succeeds."""
+        """Error of the newest attempt; None once a call succeeds."""
 
     @classmethod
     def connect(cls, context: str | None = None) -> Api:
         """Connect by the kubeconfig's ``context`` or its current one.
 
-        A pod without KUBECONFIG uses its account.  This makes no call.  ConfigError if there is
-        neither.
+        A pod without KUBECONFIG uses its account.  ConfigError if there is neither.  No call is
+        made.
         """
         return cls(ApiSession(Login.find(context)))
 
     @property
     def namespace(self) -> str:
-        """The context's, or the account's."""
+        """Namespace of the context or of the account."""
         return self._session.login.namespace
 
     @property
@@ -213,45 +214,45 @@ class Api:
 
     @property
     def server(self) -> str:
-        """The API server's host name or address."""
+        """Host name or address of the API server."""
         return self._session.server
 
     def close(self) -> None:
-        """Close the connections; one that is in use is closed after that."""
+        """Close the connections; a connection in use is closed after its use."""
         self._session.close()
 
     def get(self, path: str, **how: Unpack[_How]) -> Body:
-        """The object at ``path``."""
+        """Return the object at ``path``."""
         return self._call(ApiRequest("GET", path), **how)
 
     def list(
         self, path: str, selector: Mapping[str, str] | None = None, **how: Unpack[_How]
     ) -> Body:
-        """The list at ``path``.  ``selector`` may have labelSelector and fieldSelector."""
+        """Return the list at ``path``.  ``selector``: labelSelector and fieldSelector."""
         return self._call(ApiRequest("GET", path, selector or {}), **how)
 
     def create(self, path: str, body: Body, *, strict: bool = False, **how: Unpack[_How]) -> Body:
         """Add ``body`` to the collection ``path``.
 
-        ``strict``: Invalid for fields that the API server does not know, which it else drops.
+        ``strict``: raise Invalid for fields that the API server does not know and would drop.
         """
         query = {**_AS_SDK, "fieldValidation": "Strict"} if strict else _AS_SDK
         return self._call(ApiRequest("POST", path, query, body), **how)
 
     def apply(self, path: str, body: Body, **how: Unpack[_How]) -> Body:
-        """Server-side apply: what the last one had and ``body`` has not is removed."""
+        """Apply ``body`` on the server; fields of the last apply that it lacks are removed."""
         kind = "application/apply-patch+yaml"
         return self._call(
             ApiRequest("PATCH", path, {**_AS_SDK, "force": "true"}, body, kind), **how
         )
 
     def merge_patch(self, path: str, patch: Body, **how: Unpack[_How]) -> Body:
-        """None removes a field, a list replaces the list."""
+        """Patch an object: None removes a field, a list replaces a list."""
         kind = "application/merge-patch+json"
         return self._call(ApiRequest("PATCH", path, _AS_SDK, patch, kind), **how)
 
     def delete(self, path: str, *, uid: str | None = None, **how: Unpack[_How]) -> Body:
-        """Delete the object and what it owns; Conflict if it is not the one with this ``uid``."""
+        """Delete an object and those that it owns; Conflict if its uid is not ``uid``."""
         options: Body = {"propagationPolicy": "Background"}
         if uid is not None:
             options["preconditions"] = {"uid": uid}
@@ -298,9 +299,9 @@ class Api:
 
 
 class Watch:
-    """The events of one watch, ``{"type": …, "object": …}``, until it ends or ``stop``.
+    """Events of one watch, ``{"type": …, "object": …}``, until it ends or ``stop``.
 
-    Any end is one: a caller that wants more starts another watch where this one ended.
+    After the end, another watch can continue from the last version.
     """
 
     def __init__(self, session: ApiSession, request: ApiRequest) -> None:
@@ -311,7 +312,7 @@ class Watch:
         self._stopped = False
 
     def __iter__(self) -> Iterator[Body]:
-        """The events; raises ``ApiError``: Expired where it cannot go on from where it was."""
+        """Yield the events; ``ApiError``, Expired if the version is forgotten."""
         response = self._session.send(self._request, 2 * _WATCH_SECONDS)
         with self._lock:
             self._response = response
@@ -335,13 +336,13 @@ class Watch:
                 event = json.loads(line)
                 kind, found = event["type"], event["object"]
             except (ValueError, RecursionError, KeyError, TypeError):
-                raise ServerUnreachable(f"an event of {len(line)} bytes is no JSON") from None
+                raise ServerUnreachable(f"an event of {len(line)} bytes is not JSON") from None
             if kind == "ERROR":
                 raise error_of(int(found.get("code") or 500), {}, found)
             yield {"type": kind, "object": found}
 
     def stop(self) -> None:
-        """End it, also in the middle of waiting for an event.  Any thread."""
+        """End the watch, also while it waits for an event.  Any thread."""
         with self._lock:
             self._stopped = True
             if self._response is not None:
@@ -389,21 +390,21 @@ class ApiSession:
 
     @property
     def server(self) -> str:
-        """The API server's host name or address."""
+        """Host name or address of the API server."""
         return urllib.parse.urlsplit(self._client.configuration.host).hostname or ""
 
     def close(self) -> None:
-        """Close the connections; one that is in use is closed after that."""
+        """Close the connections; a connection in use is closed after its use."""
         self._client.close()
 
     def send(self, request: ApiRequest, read_timeout: float) -> BaseHTTPResponse:
-        """Return the response, with any status, and its body unread."""
+        """Return the response of any status, with the body unread."""
         client = self._client
         response = self._send_by(client, request, read_timeout)
         if response.status != 401:
             return response
-        # The package renews what it knows to have expired.  A token that was taken back, or whose
-        # end its plugin does not tell, is only seen to be no good by this answer.
+        # The package renews tokens that have expired.  Only this answer shows that a token was
+        # revoked, or has expired without the plugin saying when.
         response.close()
         with self._lock:
             if self._client is client:
@@ -415,7 +416,7 @@ class ApiSession:
     def _send_by(
         self, client: ApiClient, request: ApiRequest, read_timeout: float
     ) -> BaseHTTPResponse:
-        with self._lock, _login_errors():  # it may run a plugin that logs in: one is enough
+        with self._lock, _login_errors():  # it may run a plugin that logs in: one at a time
             method, url, headers, _, _ = client.param_serialize(
                 request.method,
                 request.path,
@@ -423,7 +424,7 @@ class ApiSession:
                 header_params={"Accept": "application/json", "Content-Type": request.content_type},
                 auth_settings=["BearerToken"],
             )
-        # The body goes round the package, which would look for models in it.
+        # The package must not see the body, in which it would look for its models.
         with network_errors():
             answer = client.call_api(
                 method, url, headers, request.body, _request_timeout=(CONNECT_TIMEOUT, read_timeout)
@@ -440,7 +441,7 @@ def network_errors() -> Iterator[None]:
 
     try:
         yield
-    except ApiException as error:  # TLS alone: statuses are read here
+    except ApiException as error:  # an error of TLS; statuses are checked elsewhere
         raise ServerUnreachable(str(error.reason)) from error
     except (HTTPError, OSError) as error:
         raise ServerUnreachable(str(error) or type(error).__name__) from error
@@ -448,7 +449,7 @@ def network_errors() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _login_errors() -> Iterator[None]:
-    """A login that cannot be renewed may be one a minute later: a token file that is replaced."""
+    """Turn errors of the login into Unauthorized, after which the caller may try again."""
     from kubernetes.config import ConfigException
 
     try:
@@ -458,10 +459,10 @@ def _login_errors() -> Iterator[None]:
 
 
 class Login(NamedTuple):
-    """Address of an API server and account, read anew for each client."""
+    """Address of an API server and account, read again for each client."""
 
     kubeconfig: str | None
-    """None: the account of the pod that this is."""
+    """Path of the kubeconfig; None for the account of this pod."""
     context: str | None
     namespace: str
 
@@ -483,17 +484,17 @@ class Login(NamedTuple):
                 raise ConfigError("there is no such file")
             chosen = package.config.kube_config.KubeConfigLoader(merged, active_context=context)
             namespace = chosen.current_context["context"].get("namespace") or "default"
-        except Exception as error:  # a file may hold anything
+        except Exception as error:  # a file may have any contents
             reason = " ".join(str(error).split())
             raise ConfigError(
-                f"no cluster to run processes on: {file} cannot be used: {reason}. Let KUBECONFIG "
-                "name a kubeconfig and fiber.init(context=) a context in it (`kubectl config "
+                f"no cluster to run processes on: {file} cannot be used: {reason}. Set KUBECONFIG "
+                "to a kubeconfig and fiber.init(context=) to a context in it (`kubectl config "
                 "get-contexts`), or choose another backend with FIBER_BACKEND=local"
             ) from error
         return cls(file, context, namespace)
 
     def client(self) -> ApiClient:
-        """A client that is logged in."""
+        """Return a client that is logged in."""
         package = _package()
         configuration = package.client.Configuration()
         try:
@@ -517,11 +518,10 @@ class Login(NamedTuple):
 
 @contextlib.contextmanager
 def _temporary_folder() -> Iterator[str | None]:
-    """Give the package a folder for certificates and keys of a kubeconfig, which OpenSSL reads.
+    """Yield a folder for certificates and keys of a kubeconfig, and remove it at the end.
 
-    It is gone once they are read: the package itself would delete those files when the interpreter
-    exits, and never if it is killed.  None where nothing can be written, as in a pod whose files
-    are read-only: a kubeconfig that names files needs none.
+    The package itself would delete those files when the interpreter exits, and never if it is
+    killed.  None if the file system is read-only: a kubeconfig that names files needs no folder.
     """
     try:
         made = tempfile.TemporaryDirectory(prefix="fiber-", ignore_cleanup_errors=True)
@@ -533,7 +533,7 @@ def _temporary_folder() -> Iterator[str | None]:
 
 
 def _read_certificates(client: ApiClient) -> None:
-    """Read now what each connection would read."""
+    """Read the certificates once, instead of for each connection."""
     configuration = client.configuration
     context = ssl.create_default_context(cafile=configuration.ssl_ca_cert)
     if configuration.cert_file:
@@ -552,8 +552,8 @@ def _account_namespace() -> str:
             return file.read().strip()
     except OSError as error:
         raise ConfigError(
-            f"this pod has no account to use Kubernetes with: {error}. Give it one that has the "
-            "role fiber-user and do not set automountServiceAccountToken to false, or choose "
+            f"this pod has no account for Kubernetes: {error}. Give it an account with the "
+            "role fiber-user, and do not set automountServiceAccountToken to false, or choose "
             "another backend with FIBER_BACKEND=local"
         ) from error
 
@@ -562,7 +562,7 @@ def _package() -> Any:
     try:
         import kubernetes
 
-        if importlib.util.find_spec("pathspec") is None:  # needed once the program is sent
+        if importlib.util.find_spec("pathspec") is None:  # needed to send the program
             raise ModuleNotFoundError("No module named 'pathspec'")
     except ModuleNotFoundError as error:
         raise ConfigError(
@@ -574,14 +574,14 @@ def _package() -> Any:
 
 
 class ApiResource(NamedTuple):
-    """A kind of object."""
+    """Kind of object in the API."""
 
     api_version: str
     kind: str
     plural: str
 
     def path(self, namespace: str | None = None, name: str = "") -> str:
-        """The path of one object or, without a name, of all that are there."""
+        """Return the path of one object or, without a name, of the collection."""
         group = "/apis" if "/" in self.api_version else "/api"
         scope = f"namespaces/{namespace}" if namespace is not None else ""
         return "/".join(filter(None, (group, self.api_version, scope, self.plural, name)))

@@ -39,18 +39,18 @@ from fiber_api.names import ConditionType
 from fiber_api.times import format_micro_time
 
 LOST = ("Deleted", "Replaced")
-"""Reasons of a FiberPoolError by which the pool is this program's no more."""
+"""Reasons of a FiberPoolError that mean that this program lost the pool."""
 
 
 @dataclass(frozen=True)
 class PoolMaster:
-    """Master as ``spec.master`` describes it: this program."""
+    """Content of ``spec.master`` for this program."""
 
     host: str
-    """The IP address that pods reach it at."""
+    """IP address that pods reach the program at."""
     port: int
     identity: str
-    """Name of the program, for users and for itself.  No other program has the same."""
+    """Unique name of the program, also shown to users."""
     lease_duration: int = 30
     lost_grace: int = 60
 
@@ -60,7 +60,7 @@ class PoolMaster:
         return names.address_of(self.host, self.port)
 
     def spec(self, pool: str, epoch: int) -> Body:
-        """``spec.master`` of ``pool``."""
+        """Return ``spec.master`` of ``pool``."""
         return {
             "host": self.host,
             "port": self.port,
@@ -73,7 +73,7 @@ class PoolMaster:
 
 
 class AttachedPool:
-    """FiberPool on the side of its master.  Calls block and raise ``ApiError``."""
+    """FiberPool whose master this program is.  Calls block and raise ``ApiError``."""
 
     def __init__(
         self, api: Api, found: Body, master: PoolMaster, epoch: int, *, kept_by_others: bool = False
@@ -90,7 +90,7 @@ class AttachedPool:
         self.path = POOLS.path(self.namespace, self.name)
         self._lease_path = LEASES.path(self.namespace, names.master_lease_name(self.name))
         self.connected: Callable[[], int] = lambda: 0
-        """Agents that are linked to this program, as its Lease tells; called on any thread."""
+        """Function for any thread that returns the number of linked agents, for the Lease."""
         self._acquired = ""
         """Time in the Lease that this program made."""
         self.generation = int(metadata["generation"])
@@ -115,9 +115,9 @@ class AttachedPool:
         resource_version: str | None = None,
         **how: Any,
     ) -> None:
-        """Write all that a program writes into a pool, in one document: what is left out goes.
+        """Write all fields of a pool that a program writes; fields left out are removed.
 
-        Conflict if the pool is another by now, or not that of ``resource_version``.
+        Conflict: another pool has the name now, or the pool differs from ``resource_version``.
         """
         _logs.debug("FiberPool %s/%s: %d replicas wanted", self.namespace, self.name, replicas)
         metadata = {"name": self.name, "uid": self.uid}
@@ -137,14 +137,14 @@ class AttachedPool:
         self.generation = int(self._api.apply(self.path, body, **how)["metadata"]["generation"])
 
     def loss(self, found: Body | None) -> FiberPoolError | None:
-        """Why the pool, which is as ``found`` now, is this program's no more, if that is so."""
+        """Return the error if this program lost the pool, whose document is ``found`` now."""
         metadata = {} if found is None else found["metadata"]
         if found is None or metadata["uid"] != self.uid or "deletionTimestamp" in metadata:
             return self._loss(
                 "Deleted",
                 "was deleted, and its processes with it",
-                "It is not this program's own: whoever keeps it has to make it again. Or let this "
-                "program make one for itself: leave out pool=",
+                "Its owner has to make it again. Or leave out pool= to let this program make its "
+                "own FiberPool",
             )
         holder = identity_in(found)
         if holder == self.master.identity:
@@ -152,7 +152,7 @@ class AttachedPool:
         if holder is None:
             return self._loss(
                 "Replaced",
-                "has no master any more: somebody detached this program",
+                "has no master: another client detached this program",
                 "Make a new Pool, or Process, to attach to it again",
             )
         return self._loss(
@@ -162,7 +162,7 @@ class AttachedPool:
         )
 
     def check(self) -> None:
-        """Raise FiberPoolError if the pool is this program's no more."""
+        """Raise FiberPoolError if this program lost the pool."""
         try:
             found = self._api.get(self.path, timeout=0.0)
         except NotFound:
@@ -171,9 +171,9 @@ class AttachedPool:
             raise fresh(loss)
 
     def _loss(self, reason: str, what: str, advice: str) -> FiberPoolError:
-        """``advice`` is for a pool that somebody else keeps; its own is followed by another."""
+        """Return the error.  ``advice`` is for a warm pool; another pool follows an own one."""
         if not self.kept_by_others:
-            advice = "What is to run from now on gets another FiberPool, and lost tasks run again"
+            advice = "New processes get another FiberPool, and lost tasks run again"
         return FiberPoolError(
             f"the FiberPool {self.name!r} in namespace {self.namespace!r} {what}. {advice}",
             pool=self.name,
@@ -181,19 +181,19 @@ class AttachedPool:
             reason=reason,
         )
 
-    # -- The Lease that says that the program lives
+    # -- Lease, which shows that the program lives
 
     def renew_lease(self, **how: Any) -> None:
-        """NotFound if there is none."""
+        """Renew the Lease; NotFound if there is none."""
         self._patch_lease(self._lease_spec(_micro_time()), **how)
 
     def take_lease(self, **how: Any) -> None:
-        """Be the holder of the one that is there; NotFound if there is none."""
+        """Become the holder of the existing Lease; NotFound if there is none."""
         now = _micro_time()
         self._patch_lease({**self._lease_spec(now), "acquireTime": now}, **how)
 
     def make_lease(self, **how: Any) -> None:
-        """Conflict if there is one."""
+        """Create the Lease; Conflict if there is one."""
         now = self._acquired = _micro_time()
         body = {
             "apiVersion": LEASES.api_version,
@@ -218,8 +218,8 @@ class AttachedPool:
         return written == (spec.get("holderIdentity"), spec.get("acquireTime"))
 
     def free_lease(self, **how: Any) -> None:
-        """Let the next program find that it has no holder."""
-        # A program may have lost that right since; it can still leave the pool.
+        """Give up the Lease, so that the next master finds it free."""
+        # If the right to do so was lost, the pool can be left all the same.
         with contextlib.suppress(NotFound, Forbidden):
             self._patch_lease({"holderIdentity": ""}, **how)
 
@@ -261,9 +261,9 @@ def _micro_time() -> str:
 def secret_body(
     name: str, credentials: MasterCredentials, owner: Body, labels: dict[str, str]
 ) -> Body:
-    """The Secret that the init containers of pods mount.
+    """Return the Secret that the init containers of pods mount.
 
-    It names the master's certificate: who reads the key can pose as an agent, never as the master.
+    It names the master's certificate.  A thief of the key can pose as an agent, not as the master.
     """
     texts = {names.KEY_POOL: credentials.pool_key, names.KEY_MASTER: credentials.fingerprint}
     return {
@@ -285,13 +285,13 @@ def pool_key_of(secret: Body) -> str:
 
 
 _NAME_BYTES = 8
-"""Random bytes in the name of a Secret that takes another's place."""
+"""Random bytes in the name of a Secret that replaces another one."""
 _EPOCH = 1
-"""Epoch of a program's own pool, which never has another master."""
+"""Epoch of an own pool, which never has another master."""
 
 
 class OwnPool:
-    """Pool of this program alone, from before it is made until it is deleted.
+    """FiberPool that this program makes, uses alone and deletes.
 
     Its name must never have been used before.
     """
@@ -322,15 +322,15 @@ class OwnPool:
         """Command that removes the pool if ``detach`` cannot."""
 
     def attach(self, cancel: threading.Event) -> AttachedPool:
-        """Make it, without pods; then its Secret and its Lease, which go when it goes.
+        """Make the pool without pods, then its Secret and its Lease, which are deleted with it.
 
-        It has its master from the first moment: whoever dies between two of these calls leaves a
-        pool whose master's Lease is absent or gets old, and that the operator deletes.
+        The pool names its master from the start.  If the program dies between two of these calls,
+        the master's Lease is absent or expires, and the operator deletes the pool.
         """
         attached = self._make_pool(cancel)
         while not self._make_secret(attached, cancel):
-            # A FiberPool names one Secret for ever, so another FiberPool takes its place.  If the
-            # Secret is this program's after all, it goes with the first.
+            # A FiberPool cannot change its Secret, so another FiberPool replaces it.  If this
+            # program made the Secret after all, the Secret is deleted with the first pool.
             with contextlib.suppress(NotFound, Conflict):
                 self._api.delete(self._path, uid=attached.uid, cancel=cancel)
             self._secret = f"{names.secret_name(self.name)}-{secrets.token_hex(_NAME_BYTES)}"
@@ -344,7 +344,7 @@ class OwnPool:
         return attached
 
     def detach(self, timeout: float) -> None:
-        """Delete it, if it may be there."""
+        """Delete the pool, if it may exist."""
         try:
             if self._attached is not None:
                 uid = self._attached.uid
@@ -357,7 +357,7 @@ class OwnPool:
                 return
             self._api.delete(self._path, uid=uid, timeout=timeout)
         except (NotFound, Conflict):
-            pass  # it is gone, or even its name is another's
+            pass  # the pool is gone, or another pool has its name
 
     def _make_pool(self, cancel: threading.Event) -> AttachedPool:
         self._attached = None
@@ -366,17 +366,17 @@ class OwnPool:
         return self._attached
 
     def _make_secret(self, pool: AttachedPool, cancel: threading.Event) -> bool:
-        """Return False if a Secret is there of which it cannot be known who made it.
+        """Make the Secret; return False if one exists whose maker is unknown.
 
-        An earlier attempt had no answer then.  The role fiber-user reads no Secret, so this program
-        cannot compare.
+        In that case an earlier attempt had no answer.  The role fiber-user reads no Secret, so this
+        program cannot compare the two.
         """
         secret = secret_body(self._secret, self._credentials, pool.owner, pool.labels)
         try:
             self._api.create(SECRETS.path(self.namespace), secret, cancel=cancel)
         except Conflict as error:
             if not error.repeated:
-                raise  # somebody else was faster
+                raise  # another client made it
             return False
         return True
 
@@ -406,13 +406,13 @@ class OwnPool:
             raise
 
     def _is_own(self, found: Body) -> bool:
-        """Return True if the pool has what this program wrote, and no other program knew."""
+        """Return whether the pool has values that only this program knew."""
         written = (self._master.identity, self._secret)
         return written == (identity_in(found), found["spec"].get("credentialsSecretName"))
 
 
 _PAUSE = 0.05
-"""Seconds until the next attempt after somebody else has written to the pool."""
+"""Seconds until the next attempt, after another client has changed the pool."""
 
 
 def read_pool_key(
@@ -428,8 +428,8 @@ def read_pool_key(
         return pool_key_of(secret)
     except InvalidKey as error:
         raise FiberPoolError(
-            f"{what} cannot serve: {error}. If the operator made it, delete it: it makes a new "
-            "one; then delete the pool's pods, which hold the old one",
+            f"{what} cannot be used: {error}. If the operator made it, delete it, and the operator "
+            "makes a new one. Then delete the pool's pods, which have the old one",
             pool=pool,
             namespace=namespace,
             reason=names.Reason.INVALID_CREDENTIALS,
@@ -446,14 +446,14 @@ def read_pool_key(
 
 
 class WarmPool:
-    """Pool of another owner, from before this program is its master until after that."""
+    """FiberPool of another owner, which this program attaches to and detaches from."""
 
     def __init__(self, api: Api, namespace: str, name: str, master: PoolMaster) -> None:
         self._api = api
         self._master = master
         self._attached: AttachedPool | None = None
         self._replicas = 0
-        """Replicas of the pool before, which it gets again."""
+        """Replicas of the pool before, which ``detach`` restores."""
         self.name = name
         self.namespace = namespace
         self.doing = "attach to"
@@ -467,28 +467,28 @@ class WarmPool:
         return f"kubectl patch {where} --type=merge -p '{patch}'"
 
     def attach(self, cancel: threading.Event) -> AttachedPool:
-        """Be its master from now on; FiberPoolError if it has one."""
+        """Become the pool's master; FiberPoolError if it has another one."""
         deadline = time.monotonic() + TIMEOUT
         while not self._try_to_attach(cancel):
-            # Its status was written meanwhile, or another program was faster.
+            # The operator wrote its status meanwhile, or another program attached first.
             if time.monotonic() > deadline or cancel.wait(_PAUSE):
-                raise Conflict("it changes faster than it can be attached to", status=409)
+                raise Conflict("each attempt met a change of the pool", status=409)
         assert self._attached is not None
         try:
             self._attached.make_lease(cancel=cancel)
         except Conflict:
-            self._attached.take_lease(cancel=cancel)  # the master before left it
+            self._attached.take_lease(cancel=cancel)  # of the master before
         return self._attached
 
     def detach(self, timeout: float) -> None:
-        """Leave it as it was, if this program still is its master."""
+        """Restore the pool, if this program still is its master."""
         attached = self._attached
         if attached is None:
             return
         deadline = time.monotonic() + timeout
         while not self._try_to_detach(attached, left := max(deadline - time.monotonic(), 0.0)):
             if not left:
-                raise Conflict("it changes faster than it can be detached from", status=409)
+                raise Conflict("each attempt met a change of the pool", status=409)
             time.sleep(min(_PAUSE, left))
 
     def _try_to_detach(self, attached: AttachedPool, timeout: float) -> bool:
@@ -499,7 +499,7 @@ class WarmPool:
         if attached.loss(found) is not None:
             return True
         try:
-            # While it is ours: afterwards it may be the next master's.
+            # First: after ``apply`` the Lease may belong to the next master.
             attached.free_lease(timeout=timeout)
             version = found["metadata"]["resourceVersion"]
             attached.apply(self._replicas, master=False, resource_version=version, timeout=timeout)
@@ -521,7 +521,7 @@ class WarmPool:
         attached = self._as_master(found, 1 + max(epoch, seen))
         self._replicas = 0 if there else int(found["spec"].get("replicas") or 0)
         version = found["metadata"]["resourceVersion"]
-        # `detach` looks whether the pool is ours, even if the call fails.
+        # First: if the call fails, ``detach`` checks whether it took effect.
         self._attached = attached
         try:
             attached.apply(self._replicas, resource_version=version, cancel=cancel)
@@ -533,21 +533,25 @@ class WarmPool:
         return AttachedPool(self._api, found, self._master, epoch, kept_by_others=True)
 
     def _check_lost(self, found: Body, there: Body) -> None:
-        """Raise unless the operator says that the master that is there is gone."""
+        """Raise FiberPoolError unless the operator says that the present master is lost."""
         status = found.get("status") or {}
         known = {entry["type"]: entry["status"] for entry in status.get("conditions") or ()}
-        # A status of before may be about the master before.
+        # An old status may be about an earlier master.
         current = status.get("observedGeneration", 0) >= found["metadata"]["generation"]
         if current and known.get(ConditionType.MASTER_ALIVE) == "False":
             return
         lease = self._lease_of(there)
         since = f" since {lease['acquireTime']}" if lease.get("acquireTime") else ""
-        sign = f", last heard of at {lease['renewTime']}" if lease.get("renewTime") else ""
+        sign = (
+            f", which last renewed its Lease at {lease['renewTime']}"
+            if lease.get("renewTime")
+            else ""
+        )
         raise FiberPoolError(
             f"the FiberPool {self.name!r} in namespace {self.namespace!r} is in use: its master is "
             f"{there.get('identity') or there.get('host')}{since}{sign}. Wait until that program "
-            "ends, or end it; one that was killed counts as gone "
-            f"{there.get('leaseDurationSeconds', 30)} s after its last sign of life",
+            "ends, or end it; a program that was killed counts as lost "
+            f"{there.get('leaseDurationSeconds', 30)} s after its last renewal",
             pool=self.name,
             namespace=self.namespace,
             reason="InUse",
@@ -560,5 +564,5 @@ class WarmPool:
         try:
             spec = self._api.get(LEASES.path(self.namespace, name), timeout=0.0).get("spec")
         except ApiError:
-            return {}  # it only makes the message better
+            return {}  # the Lease only adds details to the message
         return spec or {}

@@ -1,4 +1,4 @@
-"""Problems of FiberPools and ends of pods, told to the program in sentences.
+"""Problems of FiberPools and ends of pods, in sentences for the user of the program.
 
 * Functions over a FiberPool's status: which problems are new, whether they are terminal, a summary.
 * ``pod_end``: why a pod ended, from its document.
@@ -33,7 +33,7 @@ from fiber_api.names import ConditionType, Reason
 from fiber_api.times import parse_time
 
 Status = Mapping[str, Any]
-"""``status``, as the API has it: any part may be absent."""
+"""Status of a FiberPool, as the API has it: any part may be absent."""
 
 
 class PoolName(NamedTuple):
@@ -46,14 +46,14 @@ class PoolName(NamedTuple):
         return f"the FiberPool {self.name!r} in namespace {self.namespace!r}"
 
     def error(self, message: str, reason: str) -> FiberPoolError:
-        """An error of this pool."""
+        """Return an error of this pool."""
         return FiberPoolError(
             f"{self}: {message}", pool=self.name, namespace=self.namespace, reason=str(reason)
         )
 
 
 class AgentRoute(NamedTuple):
-    """Way of agents to this program."""
+    """Route of agents to this program."""
 
     address: str
     """``host:port`` that the pool's Service leads to."""
@@ -64,8 +64,8 @@ class AgentRoute(NamedTuple):
     def advice(self) -> str:
         """Reasons why agents do not arrive, and remedies."""
         others = (
-            f". Or the pods still serve {self.displaced}, which had this pool before and does not "
-            "renew its Lease: end that program"
+            f". Or the pods still serve {self.displaced}, the master before, which does not renew "
+            "its Lease: end that program"
             if self.displaced
             else ""
         )
@@ -78,11 +78,11 @@ class AgentRoute(NamedTuple):
         )
 
 
-# ---- what to warn of ------------------------------------------------------------------------
+# ---- warnings -------------------------------------------------------------------------------
 
 
 def new_problems(pool: PoolName, before: Status, status: Status) -> Iterator[str]:
-    """A sentence for each problem that ``before`` did not have, or only as a warning."""
+    """Yield a sentence for each problem that ``before`` did not have, or only as a warning."""
     told = {(problem.get("reason"), problem.get("severity")) for problem in _problems(before)}
     for problem in _problems(status):
         reason = problem.get("reason")
@@ -92,9 +92,9 @@ def new_problems(pool: PoolName, before: Status, status: Status) -> Iterator[str
             yield f"{pool}: {reason}{many}: {problem.get('message', '')}"
 
 
-# ---- what ends the wait ---------------------------------------------------------------------
+# ---- errors that end the wait ---------------------------------------------------------------
 
-_WAITS_FOR_SOMEBODY = frozenset(
+_NEEDS_A_PERSON = frozenset(
     {
         Reason.CONTAINER_CONFIG_ERROR,
         Reason.CONTAINER_ERROR,
@@ -105,26 +105,26 @@ _WAITS_FOR_SOMEBODY = frozenset(
         Reason.UNSCHEDULABLE,
     }
 )
-"""Errors that pass when somebody changes something.  Of the others that are not terminal the
-operator takes care: it tries again, and says when it gives up."""
+"""Reasons that pass only after a person changes something.  At other errors the operator tries
+again, and marks them as terminal when it gives up."""
 
 
 def running(status: Status) -> int:
-    """Return how many pods run; one whose agent does not arrive is never ready."""
+    """Return how many pods run, ready or not.  A pod whose agent is not linked is never ready."""
     return max(0, (status.get("replicas") or 0) - (status.get("pendingReplicas") or 0))
 
 
 def failure(pool: PoolName, status: Status, joined: int) -> FiberPoolError | None:
-    """Why nobody will serve the program, with ``joined`` workers there now.
+    """Return the error for which no worker will come; None if workers may come.
 
-    A pool with workers goes on with them, even if others have problems.
+    A pool with ``joined`` workers, or with pods that run, has none: it works with these.
     """
     if joined or running(status):
         return None
     if _is_true(status, ConditionType.SUSPENDED):
         return pool.error(
-            "it is suspended (spec.suspend), so that it has no workers. Set that to false, or use "
-            "another pool.",
+            "it is suspended, so it has no workers. Set spec.suspend to false, or use another "
+            "pool.",
             Reason.SUSPENDED,
         )
     for problem in _problems(status):
@@ -136,7 +136,7 @@ def failure(pool: PoolName, status: Status, joined: int) -> FiberPoolError | Non
 def overdue(
     pool: PoolName, status: Status, waited: float, now: float, way: AgentRoute
 ) -> FiberPoolError:
-    """No worker came in time: what is known of why.  ``now`` is in unix seconds."""
+    """Return the error for no worker in time.  ``now`` is in unix seconds."""
     worst = next(_problems(status), None)
     why = f"{way.advice}." if running(status) else ""
     if not why and worst is not None:
@@ -150,7 +150,7 @@ def overdue(
 
 
 def unreachable(pool: PoolName, status: Status, waited: float, way: AgentRoute) -> FiberPoolError:
-    """Return the error for pods that run and whose agents do not arrive."""
+    """Return the error for running pods whose agents do not dial."""
     number = running(status)
     pods = f"its {number} running pods" if number != 1 else "its running pod"
     return pool.error(
@@ -161,8 +161,8 @@ def unreachable(pool: PoolName, status: Status, waited: float, way: AgentRoute) 
 
 
 def _concerns_all(problem: Mapping[str, Any], status: Status) -> bool:
-    """Tell whether a problem is an error of every pod, and needs a person to mend it."""
-    if problem.get("severity") != "Error" or problem.get("reason") not in _WAITS_FOR_SOMEBODY:
+    """Return whether a problem is an error of every pod that only a person can mend."""
+    if problem.get("severity") != "Error" or problem.get("reason") not in _NEEDS_A_PERSON:
         return False
     replicas = status.get("replicas") or 0
     return problem.get("count", 1) >= replicas if problem.get("pod") else not replicas
@@ -172,7 +172,7 @@ def _told(problem: Mapping[str, Any]) -> str:
     return f"{problem.get('reason')}: {problem.get('message', '')}"
 
 
-# ---- one line for people --------------------------------------------------------------------
+# ---- summary in one line --------------------------------------------------------------------
 
 _SCHEDULER = re.compile(r"\d+/\d+ nodes are available: (?:[^.\n]|\.(?! ))+")
 
@@ -180,7 +180,7 @@ _LONGEST_CAUSE = 120
 
 
 def summary(status: Status, now: float) -> str:
-    """Return the number of pods and what keeps the others: ``12 of 50 pods ready, 30 pending:
+    """Return the number of pods and the main problem: ``12 of 50 pods ready, 30 pending:
     0/3 nodes are available: insufficient cpu (for 14 s)``.  ``now`` is in unix seconds.
     """
     if "observedGeneration" not in status:
@@ -195,7 +195,7 @@ def summary(status: Status, now: float) -> str:
 
 def _cause(problem: Mapping[str, Any], now: float) -> str:
     message = str(problem.get("message", ""))
-    # What the operator says around the scheduler's words is for who has the time to read it.
+    # The summary has the scheduler's words only, without those of the operator around them.
     scheduler = _SCHEDULER.search(message)
     cause = scheduler[0] if scheduler else f"{problem.get('reason')}: {message}"
     cause = cause.partition("\n")[0].partition(". ")[0].rstrip(".")
@@ -209,12 +209,12 @@ def _cause(problem: Mapping[str, Any], now: float) -> str:
 
 
 _OF_THE_MASTER = frozenset({Reason.LEASE_NOT_FOUND, Reason.MASTER_LOST})
-"""Reasons that do not concern this program, which lives.  It makes and renews the Lease itself: the
-operator may have looked between two of its steps, or while it was stopped."""
+"""Reasons that are false, as this program lives and renews the Lease.  The operator may have looked
+between two steps of an attachment, or while the program was stopped."""
 
 
 def _problems(status: Status) -> Iterator[Mapping[str, Any]]:
-    """The worst first, as the operator sorted them."""
+    """Yield the problems, the worst first, as the operator sorted them."""
     for problem in status.get("problems") or ():
         if problem.get("reason") not in _OF_THE_MASTER:
             yield problem
@@ -226,22 +226,22 @@ def _is_true(status: Status, kind: ConditionType) -> bool:
 
 
 class PodEnd(NamedTuple):
-    """The end of a pod, as an ``ExitReport`` and a ``WorkerDied`` tell it."""
+    """End of a pod, for ``ExitReport`` and ``WorkerDied``."""
 
     reason: str
     """Reason in one word, a colon, and details: ``OOMKilled: its memory limit is 512Mi``."""
     node: str
-    """Empty if it never had one."""
+    """Node of the pod; empty if it never had one."""
     exitcode: int | None = None
-    """Exit code as in multiprocessing; None if no program ended, or it is not known how."""
+    """Exit code as in multiprocessing; None if it is unknown."""
     disrupted: bool = False
-    """True if the cluster ended the pod, and not its programs."""
+    """True if the cluster ended the pod."""
 
 
 def pod_end(pod: Mapping[str, Any], container: str = names.WORKER_CONTAINER) -> PodEnd | None:
-    """Return how ``pod`` ended or is about to; None if it is well, as far as Kubernetes knows.
+    """Return how ``pod`` ended or is ending; None if Kubernetes reports no end.
 
-    What ended it comes before what became of its programs for that.
+    The cause of the pod's end goes before the exit codes that follow from it.
     """
     status = pod.get("status") or {}
     worker = _ended(status, container)
@@ -254,12 +254,12 @@ def pod_end(pod: Mapping[str, Any], container: str = names.WORKER_CONTAINER) -> 
 
 
 def node_of(pod: Mapping[str, Any]) -> str:
-    """The name of its node; empty while it has none."""
+    """Return the name of the pod's node; empty while it has none."""
     return str((pod.get("spec") or {}).get("nodeName") or "")
 
 
 def _ended(status: Mapping[str, Any], container: str) -> Mapping[str, Any]:
-    """The end of the container of that name; empty while it goes on."""
+    """Return the end of the container of that name; empty while it runs."""
     for found in status.get("containerStatuses") or ():
         if found.get("name") == container:
             return (found.get("state") or {}).get("terminated") or {}
@@ -273,7 +273,7 @@ def _out_of_memory(pod: Mapping[str, Any], worker: Mapping[str, Any], container:
     for found in (pod.get("spec") or {}).get("containers") or ():
         if found.get("name") == container:
             limit = ((found.get("resources") or {}).get("limits") or {}).get("memory")
-    # Without a limit of its own it was the node that had no more.
+    # Without a limit, the node had no memory left.
     return f"OOMKilled: its memory limit is {limit}" if limit else "OOMKilled: it has no limit"
 
 
@@ -290,7 +290,7 @@ _DISRUPTIONS = {
     "Shutdown": "NodeLost",
     "Terminated": "NodeLost",
 }
-"""Kubernetes' words for why it ended a pod, and what people call it."""
+"""Kubernetes' reasons for the end of a pod, and the reasons that Fiber reports."""
 
 
 def _disruption(pod: Mapping[str, Any]) -> str | None:
@@ -304,8 +304,7 @@ def _disruption(pod: Mapping[str, Any]) -> str | None:
 
 
 _LOST_CONTAINERS = ("ContainerStatusUnknown", "Unknown")
-"""Reasons of containers that a node lost sight of, for example in a restart.  Their exit code is
-made up."""
+"""Reasons of containers that a node lost, for example in a restart.  Their exit code is wrong."""
 
 
 def _deletion(pod: Mapping[str, Any]) -> str | None:
@@ -316,7 +315,7 @@ def _deletion(pod: Mapping[str, Any]) -> str | None:
 
 def _lost_container(worker: Mapping[str, Any]) -> str | None:
     lost = worker.get("reason") in _LOST_CONTAINERS
-    return "NodeLost: its node lost sight of it" if lost else None
+    return "NodeLost: its node has no record of the container" if lost else None
 
 
 def _own_end(status: Mapping[str, Any], worker: Mapping[str, Any]) -> str | None:
@@ -354,7 +353,7 @@ def _ending(exitcode: int) -> str:
 def explain(
     error: ApiError, doing: str, *, pool: str, namespace: str, server: str
 ) -> FiberPoolError:
-    """Return an error: what happened, why, what to do.  ``doing``: "make the FiberPool es"."""
+    """Return an error with advice.  ``doing``: the failed action, as "make the FiberPool es"."""
     reason, advice = _advice(error, namespace, server)
     where = f"cannot {doing} in namespace {namespace!r}"
     return FiberPoolError(
@@ -366,19 +365,19 @@ def _advice(error: ApiError, namespace: str, server: str) -> tuple[str, str]:
     match error:
         case Unauthorized():
             return "Unauthorized", (
-                f"The API server {server} does not accept this program's login, and a renewed one "
-                "neither: look with `kubectl auth whoami` and log in again"
+                f"The API server {server} accepts neither this program's login nor a renewed one: "
+                "check with `kubectl auth whoami` and log in again"
             )
         case Forbidden() | Invalid() if "ValidatingAdmissionPolicy" in error.message:
             return "Refused", (
-                "A policy of the cluster refuses it: change what the policy names with "
+                "A policy of the cluster refuses it: change the named fields with "
                 "fiber.init(template=) or in the pod of this program, or ask an administrator for "
                 "an exception"
             )
         case Forbidden() if "quota" in error.message:
             return "QuotaExceeded", (
-                f"Look with `kubectl get resourcequota -n {namespace}`, and delete what is not "
-                "needed or have the quota raised"
+                f"See `kubectl get resourcequota -n {namespace}`. Delete objects that are not "
+                "needed, or ask for a larger quota"
             )
         case Forbidden():
             return "Forbidden", (
@@ -388,8 +387,8 @@ def _advice(error: ApiError, namespace: str, server: str) -> tuple[str, str]:
             )
         case NotFound(reason=""):
             return "NotInstalled", (
-                f"The cluster at {server} knows no FiberPools: install the operator, whose chart "
-                "brings them (`helm install fiber-operator charts/fiber-operator -n fiber-system "
+                f"The cluster at {server} knows no FiberPools: install the operator with its chart "
+                " (`helm install fiber-operator charts/fiber-operator -n fiber-system "
                 "--create-namespace`), or choose another cluster with fiber.init(context=)"
             )
         case NotFound() if error.message.startswith("namespaces "):
@@ -398,31 +397,31 @@ def _advice(error: ApiError, namespace: str, server: str) -> tuple[str, str]:
                 "fiber.init(namespace=) or FIBER_NAMESPACE"
             )
         case NotFound():
-            return "NotFound", f"Look with `kubectl get fiberpools -n {namespace}` what is there"
+            return "NotFound", f"See `kubectl get fiberpools -n {namespace}` for the existing ones"
         case Invalid() if "unknown field" in error.message:
             return "OutdatedDefinition", (
-                "The CustomResourceDefinition fiberpools.fiber.dev is not of this version of "
-                "fiberpool: upgrade the operator with its chart, or install the fiberpool that "
-                "belongs to it"
+                "The CustomResourceDefinition fiberpools.fiber.dev belongs to another version of "
+                "fiberpool: upgrade the operator with its chart, or install that version of "
+                "fiberpool"
             )
         case ServerError():
             return error.reason or "InternalError", (
-                f"The API server {server} answers so, with HTTP status {error.status}: it or "
-                "something that it depends on has failed. Look with `kubectl get --raw "
+                f"The API server {server} answers with HTTP status {error.status}: it or a part "
+                "that it depends on has failed. Check with `kubectl get --raw "
                 "'/readyz?verbose'`, or try again later"
             )
         case TooManyRequests():
             return error.reason or "TooManyRequests", (
-                f"The API server {server} has too much to do, or this account has its share: try "
-                "again later, or look with `kubectl get flowschemas,prioritylevelconfigurations`"
+                f"The API server {server} is overloaded, or this account sends too many calls: try "
+                "again later, or see `kubectl get flowschemas,prioritylevelconfigurations`"
             )
         case Transient():
             return "Unreachable", (
-                f"The API server {server} cannot be reached or does not answer: look with "
+                f"The API server {server} cannot be reached or does not answer: check with "
                 "`kubectl cluster-info`"
             )
     return error.reason or "Invalid", (
-        "Correct what the API server names; fiber.init(template=) decides about pods"
+        "Correct the named fields; fiber.init(template=) sets those of pods"
     )
 
 
@@ -430,9 +429,10 @@ _EXPIRED = "Lease expired"
 
 
 class Reporter:
-    """Any thread may call; ``on_warning`` and ``on_error`` are told on the loop's.
+    """Reporter of the problems of one FiberPool.  Any thread may call it.
 
-    There is one error at most.  ``on_failure`` is called after it, on the thread that found it.
+    ``on_warning`` and ``on_error`` are called on the loop's thread, ``on_error`` once at most.
+    ``on_failure`` follows at once, on the calling thread.
     """
 
     def __init__(
@@ -452,51 +452,51 @@ class Reporter:
         self._on_error = on_error
         self._on_failure = on_failure
         self._failing = threading.Lock()
-        """Taken by the thread that reports the error, and never given back."""
+        """Acquired by the first error, and never released."""
         self._warned: set[str] = set()
         self._muted = False
 
     def mute(self) -> None:
-        """The pool is given back: nobody wants to know any more."""
+        """Report no more, since the pool is ending."""
         self._muted = True
 
     def answered(self) -> None:
-        """The API server is well: if it fails again that is news."""
+        """Note that the API server answers; its next failure is reported again."""
         kinds = {kind.__name__ for kind in (ServerUnreachable, ServerError, TooManyRequests)}
         self._warned -= {*kinds, _EXPIRED}
 
     def warn_anew(self) -> None:
-        """Somebody begins to wait, and is to be told what was told before, if it is still so."""
+        """Repeat the warnings of problems that persist."""
         self._warned.clear()
 
     def warn(self, what: str, message: str) -> None:
-        """``what`` names that of which one warning is enough until it has passed."""
+        """Warn once of the problem ``what``, until it has passed."""
         if not self._muted and what not in self._warned:
             self._warned.add(what)
             self._loop.call_soon(self._on_warning, message)
 
     def trouble(self, doing: str, error: ApiError) -> None:
         """Report an error that may pass.  ``doing``: the action, before the name of the pool."""
-        # One that fails in general fails in all that is done; of rights there are several.
+        # A failing API server gives one warning for all actions, a missing right one for each.
         kind = type(error).__name__
         what = kind if isinstance(error, Transient) else f"{kind}: {doing}"
         self.warn(what, str(self._explained(doing, error)))
 
     def expired(self, seconds: float) -> None:
-        """Tell that the Lease has not been renewed for its duration."""
+        """Warn that the Lease has not been renewed for its duration."""
         what = (
             f"may get another master: this program has not renewed its Lease for {seconds:.0f} s. "
-            "Its agents dial anew: they come back with their work, or go to the next master. See "
-            "that this program can reach the API server"
+            "Its agents connect again, to this program or to the next master. Check that this "
+            "program reaches the API server"
         )
         self.warn(_EXPIRED, str(self.error("LeaseExpired", what)))
 
     def refused(self, doing: str, error: ApiError) -> None:
-        """Report an error that will not pass."""
+        """Report an error that does not pass."""
         self.fail(self._explained(doing, error))
 
     def fault(self, error: Exception) -> None:
-        """A fault of ours must not leave anybody waiting."""
+        """Report a bug, so that no child waits for ever."""
         failure = self.error("Internal", f"is given up after an unexpected {error!r}")
         failure.__cause__ = error
         self.fail(failure)
@@ -505,10 +505,10 @@ class Reporter:
         """Report that the pool has failed."""
         if not self._muted and self._failing.acquire(blocking=False):
             self._loop.call_soon(self._on_error, error)
-            self._on_failure()  # its consequences are reported later
+            self._on_failure()  # after ``on_error`` is queued
 
     def error(self, reason: str, what: str) -> FiberPoolError:
-        """``what``: what is the matter, in words that follow the pool."""
+        """Return an error.  ``what``: the problem, in words that follow the pool's name."""
         name, namespace = self._pool
         message = f"{self._pool} {what}"
         return FiberPoolError(message, pool=name, namespace=namespace, reason=reason)
@@ -519,9 +519,9 @@ class Reporter:
         return explain(error, doing, pool=name, namespace=namespace, server=self._server)
 
     def say_what_stays(self, why: str, remedy: str) -> None:
-        """Say on stderr what stays behind.  ``remedy`` is the command that removes it."""
+        """Write to stderr that the pool is left.  ``remedy`` is the command that removes it."""
         with contextlib.suppress(Exception):  # stderr may be closed
             sys.stderr.write(
-                f"fiber: {self._pool} stays behind: {why}. The operator notices that this program "
-                f"is gone; to be quicker: {remedy}\n"
+                f"fiber: {self._pool} stays behind: {why}. The operator ends it once the Lease of "
+                f"this program has expired. To end it now: {remedy}\n"
             )

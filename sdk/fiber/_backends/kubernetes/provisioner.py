@@ -1,4 +1,4 @@
-"""Program on a cluster: its identity, its address for pods, and the start of its FiberPools.
+"""Provisioner of a program's FiberPools: its identity, its address for pods, its own pod.
 
 The address is found without connecting to another machine. A PersistentVolumeClaim that only one
 node can mount is left out of the workers' pods, because it would keep workers on other nodes from
@@ -59,39 +59,40 @@ _LONGEST_HOST_NAME = 63
 
 
 class ListenerObserver(Protocol):
-    """Hears of agents that dial in, on the loop's thread."""
+    """Observer of agents that dial in.  Called on the loop's thread."""
 
     def on_agent(self, link: Link) -> str | None:
-        """Take an agent with the pool's credentials, or return why it is not wanted."""
+        """Take an agent that has the pool's credentials, or return why it is refused."""
 
     def objection(self, identity: Identity) -> str | None:
-        """Return why an agent is not taken; "" if it is, None if that is not known yet."""
+        """Return why an agent is refused; "" if it is admitted, None if that is unknown yet."""
 
     def on_proven(self) -> None:
-        """Note that an agent proved to be of the pool, whether or not it is wanted."""
+        """Note that an agent proved that it has the pool's credentials."""
 
     def on_refused(self, why: str) -> None:
-        """Take the line to log for a connection that was turned away."""
+        """Take the reason why a connection was refused."""
 
 
 class PreparedPool(NamedTuple):
-    """A FiberPool that this program is about to be the master of, and listens for."""
+    """FiberPool to attach to, and the listener for its agents."""
 
     listener: MasterListener
     address: str
-    """``host:port`` at which pods are to reach this program."""
+    """``host:port`` that pods dial."""
     attachment: AttachablePool
     slots: int
-    """Processes that each of its pods runs."""
+    """Number of processes in each pod."""
     min_pods: int
-    """Pods that it keeps even if fewer are wanted."""
+    """Smallest number of pods."""
     max_pods: int
+    """Largest number of pods."""
 
 
 class PoolProvisioner:
-    """Prepares FiberPools for one program.
+    """Provisioner of the FiberPools of one program.
 
-    Its methods ask the API server, and block until that has answered or ``cancel`` is set.
+    Its methods block until the API server has answered or ``cancel`` is set.
     """
 
     def __init__(self, config: Config) -> None:
@@ -107,10 +108,10 @@ class PoolProvisioner:
         self._certificate = make_certificate()
         self._acceptors: dict[str, Acceptor] = {}
         """Acceptors by the host that they listen at: one, unless this machine's address changes.
-        All pools share them, and they stay until the program ends."""
+        All pools share them until the program ends."""
 
     def close(self) -> None:
-        """Listen no more, and say good-bye to the API server."""
+        """Close the acceptors and the connections to the API server."""
         for acceptor in self._acceptors.values():
             acceptor.close()
         self.api.close()
@@ -118,7 +119,7 @@ class PoolProvisioner:
     def prepare_own(
         self, shape: PodShape, loop: Loop, observer: ListenerObserver, cancel: threading.Event
     ) -> PreparedPool:
-        """A pool of this program's own, for pods of this shape."""
+        """Prepare a new pool for pods of this shape."""
         number = next(self._numbers)
         suffix = self._suffix if not number else f"{self._suffix}-{number}"
         name = pool_name(self._name, shape, suffix)
@@ -129,11 +130,11 @@ class PoolProvisioner:
         model = without_claims(own, claims.one_node) if own is not None else None
         template = pod_template(shape, model, container, sys.executable)
         if own is not None and number == 0:
-            _say_what_stays_behind(secrets_left_out(own, container))
+            _report_withheld_variables(secrets_left_out(own, container))
             for line in claims.warnings(template):
                 _say(line)
         body = fiber_pool_body(name, template, self._config)
-        # Last: a failure before this leaves nothing open.
+        # Last: an error before it leaves no listener open.
         master, listener = self._listen(name, credentials, loop, observer)
         attachment = OwnPool(self._api, self.namespace, body, credentials, master, self._owner(own))
         slots = self._config.processes_per_pod
@@ -142,7 +143,7 @@ class PoolProvisioner:
     def prepare_warm(
         self, name: str, loop: Loop, observer: ListenerObserver, cancel: threading.Event
     ) -> PreparedPool:
-        """A pool that somebody else keeps."""
+        """Prepare to attach to a pool of another owner."""
         try:
             path = POOLS.path(self.namespace, name)
             spec = self._api.get(path, cancel=cancel)["spec"]
@@ -198,11 +199,11 @@ class PoolProvisioner:
 
     def _master(self, host: str, listener: MasterListener) -> PoolMaster:
         port = int(listener.address.rpartition(":")[2])
-        # The suffix makes it this program's, and not an earlier one's of the same pid.
+        # The suffix tells this program from an earlier one with the same pid.
         return PoolMaster(host, port, f"{socket.gethostname()}:{os.getpid()}:{self._suffix}")
 
     def _find_own_pod(self, cancel: threading.Event) -> Body | None:
-        """The pod that this program runs in, if it is in one."""
+        """Return the pod that this program runs in; None outside of pods."""
         if not self._api.in_cluster:
             return None
         with self._lock:
@@ -229,7 +230,7 @@ class PoolProvisioner:
 
     def _claims(self, own: Body, container: str, cancel: threading.Event) -> VolumeClaims:
         try:
-            return look_up(self._api, self.namespace, own, container, cancel)
+            return look_up_claims(self._api, self.namespace, own, container, cancel)
         except ApiError as error:
             raise self._explained(error, "read the claims of this program's pod", "") from error
 
@@ -249,12 +250,12 @@ class PoolProvisioner:
         }
 
 
-def _say_what_stays_behind(variables: list[str]) -> None:
+def _report_withheld_variables(variables: list[str]) -> None:
     if variables:
         _say(
             f"workers do not get the variables {', '.join(variables)}: they look like "
-            "secrets, and everybody who may read FiberPools could read their values there. Take "
-            "them from a Secret (valueFrom.secretKeyRef) in the manifest of this program"
+            "secrets, and a FiberPool shows their values to all its readers. Take them from a "
+            "Secret (valueFrom.secretKeyRef) in the manifest of this program"
         )
 
 
@@ -272,18 +273,18 @@ def _mountinfo() -> str:
 
 
 _NODES = 10
-"""Nodes that are looked at: the way to one is mostly the way to all."""
+"""Number of nodes to look at: the route to one is mostly the route to all."""
 
 _ELSEWHERE = ("192.0.2.1", "2001:db8::1")
-"""Addresses that are nobody's (RFC 5737, RFC 3849): the way to them is the default route."""
+"""Unused addresses (RFC 5737, RFC 3849), to which the default route leads."""
 
 
 def reachable_address(api: Api, listen_host: str | None, *, pool: str, namespace: str) -> str:
-    """The IP address that pods reach this program at.
+    """Return the IP address that pods reach this program at.
 
-    ``listen_host``, if it names one.  Else the local address on the way to the cluster's nodes, to
-    its API server, or out of this machine: of these the first that is no loopback.  In a pod that
-    is the pod's.  FiberPoolError if all are.
+    This is ``listen_host``, if it names an address.  Else it is the first that is not a loopback,
+    of the local addresses on the routes to the cluster's nodes, to the API server, and out of this
+    machine.  In a pod it is the pod's.  FiberPoolError: all are loopbacks.
     """
     if listen_host is not None and not _is_unspecified(listen_host):
         return resolved("listen_host", listen_host)
@@ -292,7 +293,7 @@ def reachable_address(api: Api, listen_host: str | None, *, pool: str, namespace
         if found is not None and _is_reachable(found):
             return found
     raise FiberPoolError(
-        f"pods cannot reach this program: the only address of this machine on the way to the "
+        f"pods cannot reach this program: the only address of this machine on the route to the "
         f"cluster at {api.server} is a loopback. Set listen_host (fiber.init(listen_host=) or "
         "FIBER_LISTEN_HOST) to an address of this machine that pods can reach, run the program in "
         "a pod, or set advertised_host too where pods reach this machine at another address",
@@ -313,7 +314,7 @@ def _node_addresses(api: Api) -> Iterator[str]:
     try:
         nodes = api.list(NODES.path(), {"limit": str(_NODES)}, timeout=0.0)["items"]
     except ApiError:
-        return  # few may list them; whoever else cannot be reached is told by the next call
+        return  # the right is rare; if the server cannot be reached, the next call says so
     for node in nodes:
         for address in node.get("status", {}).get("addresses", ()):
             if address.get("type") == "InternalIP":
@@ -328,7 +329,7 @@ def _local_address(target: str) -> str | None:
             probe.connect(where)
             return str(probe.getsockname()[0])
     except OSError:
-        return None  # no such name, or no way there
+        return None  # no such name, or no route to it
 
 
 def resolved(key: str, host: str) -> str:
@@ -338,7 +339,7 @@ def resolved(key: str, host: str) -> str:
     except OSError as error:
         raise _useless(key, host, f"has no address ({error})") from error
     if not _is_reachable(found):
-        raise _useless(key, host, f"is {found}, which is another machine in each pod")
+        raise _useless(key, host, f"is {found}, an address that means another machine in each pod")
     return found
 
 
@@ -366,20 +367,20 @@ _ONE_NODE = {"ReadWriteOnce", "ReadWriteOncePod"}
 
 
 class VolumeClaims(NamedTuple):
-    """The claims that need a word."""
+    """Claims of the program's pod that need a warning."""
 
     one_node: tuple[str, ...] = ()
-    """Names of those that one node alone may mount."""
+    """Names of claims that only one node may mount."""
     unread: Mapping[str, str] = {}
-    """Why a claim cannot be read, by its name."""
+    """Reasons why claims cannot be read, by their names."""
 
     def warnings(self, template: Mapping[str, Any]) -> list[str]:
-        """Lines about the claims, for a program whose workers have this pod template."""
+        """Return warnings for workers that have this pod template."""
         mounted = set(_claims_by_volume(template["spec"]).values())
         left_out = [claim for claim in self.one_node if claim not in mounted]
         lines = [
             f"workers mount the PersistentVolumeClaim {claim} as this program does, though it "
-            f"cannot be read ({why}): if one node alone may mount it, workers on other nodes do "
+            f"cannot be read ({why}): if only one node may mount it, workers on other nodes do "
             "not start. Give this program's account the right to get persistentvolumeclaims, "
             "which the role fiber-user has"
             for claim, why in self.unread.items()
@@ -387,17 +388,17 @@ class VolumeClaims(NamedTuple):
         if left_out:
             lines.append(
                 f"workers do not get the PersistentVolumeClaims {', '.join(left_out)}: their "
-                "access mode lets one node alone mount them, and workers run on others, too. Use a "
+                "access mode lets only one node mount them, and workers also run on others. Use a "
                 "claim with ReadWriteMany or ReadOnlyMany, or bring the volumes and volumeMounts "
                 "with fiber.init(template=), where a nodeSelector can keep workers on that node"
             )
         return lines
 
 
-def look_up(
+def look_up_claims(
     api: Api, namespace: str, pod: Mapping[str, Any], container: str, cancel: threading.Event
 ) -> VolumeClaims:
-    """Ask what the claims allow that the container mounts, for workers in ``namespace``."""
+    """Look up the claims that the container mounts, for workers in ``namespace``."""
     found = next(c for c in pod["spec"]["containers"] if c["name"] == container)
     uses = (*(found.get("volumeMounts") or ()), *(found.get("volumeDevices") or ()))
     used = {use["name"] for use in uses}
