@@ -47,7 +47,7 @@ def test_environments_whose_pod_is_deleted_are_made_anew(programs: Programs, sce
     assert received["truncated"] == {"2": True, "3": True}
     assert all(pod in told for told in received["restarted"].values()), received
     program.says("goes on")
-    assert "environments 2 to 3 made anew: " in program.ends()
+    assert "environments 2 to 3 replaced: " in program.ends()
     leaves_nothing(program)
 
 

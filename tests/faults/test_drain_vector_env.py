@@ -72,7 +72,7 @@ def test_a_worker_answers_the_step_that_it_is_at_and_moves(
     env.step_async(UNDER_WAY)
     agent = site.drain(host_of(env, 2))
     gate.touch()
-    with pytest.warns(RuntimeWarning, match=f"environments 2 to 3 made anew: .*{REASON}"):
+    with pytest.warns(RuntimeWarning, match=f"environments 2 to 3 replaced: .*{REASON}"):
         (observations, _, _, truncations, _), after = end_step_and_make_another(env)
     assert observations.tolist() == [[2]] * 4
     assert not truncations.any()
@@ -91,7 +91,7 @@ def test_workers_that_have_nothing_to_do_move_before_the_next_call(
 ) -> None:
     before = env.call("pid")
     agent = site.drain(host_of(env, 2))
-    with pytest.warns(RuntimeWarning, match="environments 2 to 3 made anew: "):
+    with pytest.warns(RuntimeWarning, match="environments 2 to 3 replaced: "):
         pids = env.call("pid")
     assert pids[:2] == before[:2]
     assert not set(pids[2:]) & set(before)
@@ -104,7 +104,7 @@ def test_a_step_that_does_not_end_in_time_ends_its_episodes_and_no_others(
 ) -> None:
     env.step_async(UNDER_WAY)
     site.drain(host_of(env, 2))
-    with pytest.warns(RuntimeWarning, match=f"(?s)environments 2 to 3 made anew: .*{REASON}"):
+    with pytest.warns(RuntimeWarning, match=f"(?s)environments 2 to 3 replaced: .*{REASON}"):
         observations, _, _, truncations, _ = env.step_wait(timeout=PATIENCE)
     assert observations.tolist() == [[2], [2], [1], [1]]
     assert truncations.tolist() == [False, False, True, True]
@@ -139,7 +139,7 @@ def test_environments_are_made_elsewhere_if_their_making_does_not_end_in_time(
 
     with ThreadPoolExecutor(1) as threads:
         drained = threads.submit(drain_the_first)
-        with pytest.warns(RuntimeWarning, match="environment 0 made anew"):
+        with pytest.warns(RuntimeWarning, match="environment 0 replaced"):
             env = VectorEnv([partial(make_at_the_second_try, tmp_path)])
         drained.result()
     try:

@@ -1,4 +1,4 @@
-"""Environments that raise, hang or kill their worker: told by number, and made anew if asked."""
+"""Environments that raise, hang or kill their worker: told by number, and replaced if asked."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_one_that_raises(vector_env: Make) -> None:
 def test_one_that_raises_is_made_anew(vector_env: Make) -> None:
     env = vector_env(on_error="restart")
     env.step([GOOD] * 4)
-    with pytest.warns(RuntimeWarning, match="environment 2 made anew: step raised Arithm"):
+    with pytest.warns(RuntimeWarning, match="environment 2 replaced: step raised Arithm"):
         observations, rewards, terminations, truncations, infos = env.step(
             [GOOD, GOOD, Faulty.RAISE, GOOD]
         )
@@ -105,7 +105,7 @@ def test_one_that_ends_its_worker(action: int, backend: str, vector_env: Make) -
 def test_a_worker_that_died_is_started_anew(mode: str, vector_env: Make) -> None:
     env = vector_env(on_error="restart", autoreset_mode=mode)
     env.step([GOOD] * 4)
-    with pytest.warns(RuntimeWarning, match=r"environments 2 to 3 made anew: worker '.*-1' died"):
+    with pytest.warns(RuntimeWarning, match=r"environments 2 to 3 replaced: worker '.*-1' died"):
         observations, _, _, truncations, infos = env.step([GOOD, GOOD, Faulty.SEGFAULT, GOOD])
     assert truncations.tolist() == [False, False, True, True]
     assert "died while it ran step" in infos["restarted"][2]
@@ -132,7 +132,7 @@ def test_one_that_hangs(vector_env: Make) -> None:
 
 def test_one_that_hangs_is_made_anew(vector_env: Make) -> None:
     env = vector_env(timeout=2, on_error="restart")
-    with pytest.warns(RuntimeWarning, match=r"environment 1 made anew: .*longer than 2 s"):
+    with pytest.warns(RuntimeWarning, match=r"environment 1 replaced: .*longer than 2 s"):
         observations, _, _, truncations, _ = env.step([GOOD, Faulty.HANG, GOOD, GOOD])
     assert truncations.tolist() == [False, True, False, False]
     assert observations.tolist() == [[1], [0], [1], [1]]
@@ -142,7 +142,7 @@ def test_one_that_hangs_is_made_anew(vector_env: Make) -> None:
 def test_a_worker_that_nothing_stops(vector_env: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(worker_process, "GRACE", 0.3)
     env = vector_env(timeout=1.5)
-    with pytest.raises(fiber.TimeoutError, match=r"nothing but its end stopped worker '.*-0'"):
+    with pytest.raises(fiber.TimeoutError, match=r"so worker '.*-0' was killed"):
         env.step([GOOD, Faulty.HANG_NATIVE, GOOD, GOOD])
 
 
@@ -156,7 +156,7 @@ def test_first_ready_goes_on_without_those_that_fail(vector_env: Make) -> None:
             _, _, _, truncations, infos = env.recv(1)
             seen[int(infos["env_id"][0])] = bool(truncations[0])
 
-    with pytest.warns(RuntimeWarning, match="anew"):
+    with pytest.warns(RuntimeWarning, match="replaced"):
         receive()
     assert seen == {0: False, 1: False, 2: True, 3: True}
     works(env)
@@ -176,7 +176,7 @@ def test_a_worker_that_is_killed_while_nothing_is_asked(vector_env: Make) -> Non
     pid = env.call("pid")[0]
     os.kill(pid, signal.SIGKILL)
     wait_for(lambda: not alive(pid))
-    with pytest.warns(RuntimeWarning, match="(?s)environments 0 to 1 made anew: .*SIGKILL"):
+    with pytest.warns(RuntimeWarning, match="(?s)environments 0 to 1 replaced: .*SIGKILL"):
         truncations = env.step([GOOD] * 4)[3]
     assert truncations.tolist() == [True, True, False, False]
     works(env)
@@ -185,7 +185,7 @@ def test_a_worker_that_is_killed_while_nothing_is_asked(vector_env: Make) -> Non
 def test_a_worker_that_dies_in_a_call(vector_env: Make) -> None:
     env = vector_env(on_error="restart")
     with (
-        pytest.warns(RuntimeWarning, match="anew"),
+        pytest.warns(RuntimeWarning, match="replaced"),
         pytest.raises(fiber.WorkerDied, match="a call"),
     ):
         env.call("exit", 0)
@@ -198,7 +198,7 @@ def test_one_that_kills_each_worker_is_given_up(vector_env: Make, tmp_path: Path
     env = vector_env(partial(Faulty, last=last), on_error="restart")
     last.touch()
     with (
-        pytest.warns(RuntimeWarning, match="made anew") as warned,
+        pytest.warns(RuntimeWarning, match="replaced") as warned,
         pytest.raises(fiber.WorkerDied, match="the making of environments 0 to 1") as caught,
     ):
         env.step([Faulty.EXIT, GOOD, GOOD, GOOD])
@@ -219,7 +219,7 @@ def test_an_answer_that_cannot_be_pickled(vector_env: Make) -> None:
 
 def test_one_whose_answer_cannot_be_pickled_is_made_anew(vector_env: Make) -> None:
     env = vector_env(on_error="restart")
-    with pytest.warns(RuntimeWarning, match="environment 3 made anew: step raised TypeError"):
+    with pytest.warns(RuntimeWarning, match="environment 3 replaced: step raised TypeError"):
         _, rewards, _, truncations, infos = env.step([GOOD, GOOD, GOOD, Faulty.UNPICKLABLE])
     assert rewards.tolist() == [1, 1, 1, 0]
     assert truncations.tolist() == [False, False, False, True]
@@ -234,7 +234,7 @@ def test_one_whose_observation_cannot_be_pickled_is_made_anew(
 ) -> None:
     env = vector_env(Telling, on_error="restart", autoreset_mode=mode)
     env.step([GOOD] * 4)
-    with pytest.warns(RuntimeWarning, match="environment 3 made anew: step raised TypeError"):
+    with pytest.warns(RuntimeWarning, match="environment 3 replaced: step raised TypeError"):
         observations, _, _, truncations, infos = env.step([GOOD, GOOD, GOOD, Faulty.UNPICKLABLE])
     at_once = mode is AutoresetMode.SAME_STEP
     assert observations == ("2", "2", "2", "none" if at_once else "1")

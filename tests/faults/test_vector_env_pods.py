@@ -56,7 +56,7 @@ def test_a_pod_that_is_deleted_between_send_and_recv(cluster: FakeCluster, tmp_p
         victim = env.call("getenv", names.ENV_NAME)[2]
         env.send([Faulty.GOOD, Faulty.GOOD, Faulty.WAIT, Faulty.GOOD])
         cluster.do(cluster.world.store.delete, "pods", "lab", victim)
-        with pytest.warns(RuntimeWarning, match="(?s)environments 2 to 3 made anew: .*pod"):
+        with pytest.warns(RuntimeWarning, match="(?s)environments 2 to 3 replaced: .*pod"):
             _, _, _, truncations, infos = env.recv(4, timeout=PATIENCE)
         truncated = dict(zip(infos["env_id"].tolist(), truncations.tolist(), strict=True))
         assert truncated == {0: False, 1: False, 2: True, 3: True}

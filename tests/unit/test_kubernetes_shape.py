@@ -110,9 +110,9 @@ class TestTemplates:
     @pytest.mark.parametrize(
         ("template", "complaint"),
         [
-            ({"containers": []}, "has 'containers' beside metadata and spec. What belongs to the "),
+            ({"containers": []}, "has 'containers' beside metadata and spec. Put fields of the "),
             ({"spec": {}, "Spec": {}}, "has 'Spec' beside metadata and spec$"),
-            ({"spec": []}, "has a spec that is no object"),
+            ({"spec": []}, "has a spec that is not an object"),
             ({"spec": {"containers": [{"image": "x"}]}}, "a container without a name.*'worker'"),
             ({"spec": {"containers": ["x"]}}, "a container without a name"),
             (
@@ -130,5 +130,5 @@ class TestTemplates:
 
     def test_a_list_is_none(self, tmp_path: Path) -> None:
         (tmp_path / "pod.yaml").write_text("- spec: {}\n")
-        with pytest.raises(ConfigError, match=r"pod\.yaml is no object with metadata and spec"):
+        with pytest.raises(ConfigError, match=r"pod\.yaml is not an object with metadata and spec"):
             read_template(str(tmp_path / "pod.yaml"))

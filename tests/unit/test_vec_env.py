@@ -216,7 +216,7 @@ def test_environments_made_anew(vec_env: Make) -> None:
     env = vec_env([Faulty] * 3, on_error="restart")
     env.reset()
     env.step([0, 0, 0])
-    with pytest.warns(RuntimeWarning, match="environment 1 made anew"):
+    with pytest.warns(RuntimeWarning, match="environment 1 replaced"):
         observations, rewards, dones, infos = env.step([0, Faulty.RAISE, 0])
     assert observations.tolist() == [[2], [0], [2]]
     assert rewards.tolist() == [1, 0, 1]
@@ -232,7 +232,7 @@ def test_functions_that_make_one_environment_only() -> None:
     from fiber.vector import VecEnv
 
     env = Faulty()
-    with pytest.raises(ValueError, match="made before") as caught:
+    with pytest.raises(ValueError, match="had returned before") as caught:
         VecEnv([lambda: env] * 2, num_workers=1)
     assert caught.value.__notes__ == ["the making of environment 1, of worker 'VecEnv-worker-0'"]
 

@@ -294,7 +294,7 @@ def test_first_ready(vector_env: Make) -> None:
         assert observations[:, 0].tolist() == seen[numbers].tolist()
         seen[numbers] += 1
         env.send(np.zeros(3, np.int64))
-    with pytest.raises(AlreadyPendingCallError, match="was told something before"):
+    with pytest.raises(AlreadyPendingCallError, match="whose result was not received yet"):
         env.send([0], env_ids=[0])
     with pytest.raises(AlreadyPendingCallError, match="pending call to `send`"):
         env.reset()

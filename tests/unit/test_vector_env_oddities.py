@@ -191,7 +191,7 @@ def test_an_observation_of_another_shape(vector_env: Make) -> None:
 
     env = vector_env([Wide] * 2)
     env.reset()
-    with pytest.raises(ValueError, match=r"has the shape \(3,\), where its space has \(1,\)"):
+    with pytest.raises(ValueError, match=r"has the shape \(3,\), but its space has \(1,\)"):
         env.step([1, 3])
 
 
@@ -294,7 +294,7 @@ def test_one_that_never_does_anything_again_is_given_up(
     env.reset()
     (tmp_path / "flag").touch()
     for _ in range(ATTEMPTS):
-        with pytest.warns(RuntimeWarning, match="made anew"):
+        with pytest.warns(RuntimeWarning, match="replaced"):
             truncations = env.step([0, 0])[3]
         assert truncations.tolist() == [True, True]
     with pytest.raises(error):
@@ -307,7 +307,7 @@ def test_one_that_raises_again_and_again_and_works_between_is_not_given_up(
     env = vector_env([Faulty] * 2, on_error="restart")
     env.reset()
     for _ in range(2 * ATTEMPTS):
-        with pytest.warns(RuntimeWarning, match="made anew"):
+        with pytest.warns(RuntimeWarning, match="replaced"):
             truncations = env.step([Faulty.GOOD, Faulty.RAISE])[3]
         assert truncations.tolist() == [False, True]
         assert env.step([Faulty.GOOD, Faulty.RAISE])[3].tolist() == [False, False]

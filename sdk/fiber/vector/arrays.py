@@ -1,7 +1,7 @@
-"""Arrays of one step of many environments: actions, observations, rewards, endings.
+"""Spaces of many environments, and the arrays of one step: actions, observations, rewards, ends.
 
-``Columns`` keep the values of many environments, of one space, each in its row.  A number, or an
-array of one shape, has its row in a NumPy array, which may be in memory that processes share.
+``Columns`` keep the values of one space, with a row for each environment.  Numbers, and arrays of
+one shape, are rows of a NumPy array, which may be in memory that processes share.
 Values without a fixed size (text, graphs, sequences, unknown spaces) are kept as objects, which
 travel in messages. A Dict or Tuple is a tree of these.
 """
@@ -25,13 +25,13 @@ from fiber._hub.protocol import ObjectKind
 
 Array: TypeAlias = npt.NDArray[Any]
 Rows: TypeAlias = Sequence[int] | slice
-"""Rows of a column; a slice where they lie side by side."""
+"""Rows of a column; a slice if they are adjacent."""
 
 Allocate: TypeAlias = Callable[[tuple[int, ...], Any], Array]
-"""Function that makes the array of a shape and type."""
+"""Function that makes an array of a shape and type."""
 
 ALIGNMENT = 64
-"""Alignment of arrays in shared memory, in bytes: each begins in its own line of the cache."""
+"""Alignment of arrays in shared memory, in bytes: each begins in another line of the cache."""
 
 
 class Columns(Protocol):
@@ -47,7 +47,7 @@ class Columns(Protocol):
         """Return the value of one environment, which later steps do not change."""
 
     def fits(self, batch: Any, count: int) -> bool:
-        """Tell whether ``fill`` takes this batch of ``count`` values without changing any."""
+        """Return whether ``fill`` takes this batch of ``count`` values without a conversion."""
 
     def fill(self, rows: Rows, batch: Any) -> None:
         """Set the values of many environments from a batch of them."""
@@ -55,13 +55,13 @@ class Columns(Protocol):
     def batch(self, rows: Rows) -> Any:
         """Return the values of ``rows`` as Gymnasium batches them.
 
-        They are views of the arrays where ``rows`` is a slice, else copies.
+        They are views of the arrays if ``rows`` is a slice, else copies.
         """
 
     def pack(self, rows: Rows, *, shared: bool) -> Any:
-        """Return what must be sent so that another process has these values.
+        """Return the message by which another process gets these values.
 
-        ``shared``: that process has the same arrays.  Then None is enough for arrays.
+        ``shared``: that process has the same arrays, so None stands for them.
         """
 
     def unpack(self, rows: Rows, packed: Any) -> None:
@@ -85,7 +85,7 @@ class ArrayColumn:
             value = np.asarray(value)
         if value.shape != self._shape:
             raise ValueError(
-                f"an observation has the shape {value.shape}, where its space has {self._shape}"
+                f"an observation has the shape {value.shape}, but its space has {self._shape}"
             )
         if self._views is None:
             self._array[row] = value
@@ -130,7 +130,7 @@ class ObjectColumn:
         self._before = values.copy()
 
     def put(self, row: int, value: Any) -> None:
-        if value is not self._values[row]:  # else it is shown once more
+        if value is not self._values[row]:  # else the value is put again
             self._before[row] = self._values[row]
             self._values[row] = value
 
@@ -141,7 +141,7 @@ class ObjectColumn:
         return self._values[row]
 
     def fits(self, batch: Any, count: int) -> bool:
-        return False  # it would have to travel all the same
+        return False  # objects must be sent in any case
 
     def fill(self, rows: Rows, batch: Iterable[Any]) -> None:
         numbers = range(len(self._values))[rows] if isinstance(rows, slice) else rows
@@ -249,7 +249,7 @@ class TupleColumns:
 
 
 def columns_of(space: Space[Any], count: int, allocate: Allocate) -> Columns:
-    """Columns for ``count`` values of a space."""
+    """Return columns for ``count`` values of a space."""
     if isinstance(space, spaces.Dict):
         return DictColumns(
             {key: columns_of(part, count, allocate) for key, part in space.spaces.items()}
@@ -273,7 +273,7 @@ class Carver:
         length = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
         begin, self.size = self.size, self.size + -(-length // ALIGNMENT) * ALIGNMENT
         if self._memory is None:
-            # No memory either: all its elements are one.
+            # All elements share one place, so this takes no memory.
             return np.broadcast_to(np.zeros((), dtype), shape)
         return np.ndarray(shape, dtype, self._memory[begin : begin + length])
 
@@ -308,7 +308,7 @@ Packed: TypeAlias = tuple[Any, Array | None, Array | None, Array | None]
 
 
 class ArrayLayout(NamedTuple):
-    """Spaces and numbers on which the arrays depend."""
+    """Spaces and numbers that determine the arrays."""
 
     observation_space: Space[Any]
     """Observation space of one environment."""
@@ -317,6 +317,7 @@ class ArrayLayout(NamedTuple):
     num_envs: int
     """Number of environments."""
     workers: int
+    """Number of workers."""
 
     def size(self) -> int:
         """Bytes of shared memory that the arrays take."""
@@ -335,7 +336,7 @@ class StepArrays:
         self.terminations = allocate((shape.num_envs,), np.bool_)
         self.truncations = allocate((shape.num_envs,), np.bool_)
         self.at_work = allocate((shape.workers,), np.int64)
-        """Row that each worker is busy with, plus one; 0 if none.  It shows where a worker died."""
+        """Row that each worker is busy with, plus one; 0 if none.  It names a dead worker's row."""
 
     @classmethod
     def private(cls, shape: ArrayLayout) -> StepArrays:
@@ -369,7 +370,7 @@ class StepArrays:
         self.truncations[row] = truncated
 
     def pack(self, rows: Rows, *, shared: bool) -> Packed | None:
-        """Return what must be sent of the results in ``rows``; None if nothing must.
+        """Return the message with the results in ``rows``; None if none is needed.
 
         ``shared``: the receiver has the same arrays.
         """
@@ -441,21 +442,21 @@ class Spaces(NamedTuple):
     ) -> Spaces:
         """Batch the observation and action space of each environment.
 
-        RuntimeError if they differ in what they must have in common; ``name`` says how an
-        environment is called in it.
+        RuntimeError: the spaces differ too much.  ``name`` returns the name of an environment for
+        the message.
         """
         observations, actions = zip(*pairs, strict=True)
         single = mode[1] if isinstance(mode, tuple) else observations[0]
         equivalent = _equal if mode == "same" else _alike
         for number, (observation, action) in enumerate(pairs):
-            # Those of one worker are often one object, as pickling keeps them.
+            # The spaces of one worker are often one object.
             if observation is not single and not equivalent(observation, single):
                 differs = f"{name(number)}, has {observation}, not {single}"
                 message = _NOT_EQUIVALENT if mode == "same" else _NOT_ALIKE
                 raise RuntimeError(message.format(differs))
             if action is not actions[0] and action != actions[0]:
                 raise RuntimeError(
-                    "the sub-environments action spaces are not equivalent, and one batch of "
+                    "the sub-environments action spaces are not equivalent, but one batch of "
                     f"actions is for all. {name(number)}, has {action}, not {actions[0]}"
                 )
         batch = _batch_space(observations, mode)
@@ -463,7 +464,7 @@ class Spaces(NamedTuple):
 
 
 def check_mode(mode: ObservationMode) -> None:
-    """TypeError or ValueError if there is no such mode."""
+    """Raise TypeError or ValueError if there is no such mode."""
     if isinstance(mode, tuple):
         kinds = [type(part) for part in mode]
         if not all(issubclass(kind, Space) for kind in kinds):
@@ -479,7 +480,7 @@ def _batch_space(observations: Sequence[Space[Any]], mode: ObservationMode) -> S
     if isinstance(mode, tuple):
         return mode[0]
     first = observations[0]
-    # Equal ones of any kind can be batched; "same" was compared already.
+    # Equal spaces of any kind can be batched; in the mode "same" they are equal.
     if mode == "same" or all(each is first or each == first for each in observations):
         return batch_space(first, len(observations))
     return batch_differing_spaces(list(observations))
@@ -490,5 +491,5 @@ def _equal(one: Space[Any], other: Space[Any]) -> bool:
 
 
 def _alike(one: Space[Any], other: Space[Any]) -> bool:
-    # Gymnasium compares the shapes of its own kinds of space alone.
+    # Gymnasium compares the shapes of its own classes only.
     return one == other or is_space_dtype_shape_equiv(one, other)

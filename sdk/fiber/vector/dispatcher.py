@@ -1,4 +1,7 @@
-"""Dispatch of commands to environments, their answers, and the replacement of failed ones."""
+"""Dispatch of commands to environments, their answers, and the replacement of failed workers.
+
+``SubEnvironments`` is the base of both vector environments, Gymnasium's and stable-baselines3's.
+"""
 
 from __future__ import annotations
 
@@ -50,8 +53,8 @@ _STEP = PendingCommand("step")
 class Dispatcher:
     """Dispatcher of commands to workers.  Environments are known by their numbers.
 
-    ``restart``: environments whose worker has died are made anew.  Those of a worker that the
-    cluster ends are in any case, ``disruptions`` times in a row.
+    ``restart``: environments of a worker that has died are replaced.  Environments of a worker that
+    the cluster ended are replaced in any case, ``disruptions`` times in a row at most.
     """
 
     def __init__(self, workers: WorkerGroup, *, restart: bool, disruptions: int) -> None:
@@ -60,11 +63,11 @@ class Dispatcher:
         self._restart = restart
         self._disruptions = disruptions
         self._calls: list[_CommandPart] = []
-        """Whose results are awaited."""
+        """Parts of the last call of methods."""
         self._ready: deque[int] = deque()
         self._notes: dict[int, Note] = {}
         self._failures: list[tuple[int, Exception]] = []
-        """Each with the number of an environment."""
+        """Errors to raise, each with the number of an environment."""
         self._begun = False
 
     # Beginning and end
@@ -76,7 +79,7 @@ class Dispatcher:
         self._wait(self._all_there, None)
 
     def begin(self, shape: ArrayLayout, arrays: StepArrays, memory: ArrayMemory | None) -> None:
-        """Give them the arrays: those of this host share them, if they lie in ``memory``."""
+        """Give the workers the arrays; workers of this host share ``memory``."""
         self._shape, self._arrays, self._memory = shape, arrays, memory
         self._begun = True
         for worker in self._workers:
@@ -87,13 +90,13 @@ class Dispatcher:
         """End the workers; kill those that have not ended when ``timeout`` is over."""
         self._workers.close(timeout)
 
-    # Commands: nobody is told anything before all of it is pickled.
+    # Commands.  All parts of a command are pickled before the first is sent.
 
     def step(self, numbers: Sequence[int] | None, actions: Any, *, together: bool) -> None:
         """Step some environments, or all.
 
-        ``actions``: a list with one for each, or None if they are in the arrays.  ``together``:
-        nobody asks for the first of them that are done.
+        ``actions``: a list with one for each, or None if they are in the arrays.  ``together``: the
+        caller waits for all of them.
         """
         self._move_idle_workers()
         commands = []
@@ -105,10 +108,10 @@ class Dispatcher:
             else:
                 where = slice(None) if group.rows is None else group.rows
                 payload = (group.worker.arrays.actions.pack(where, shared=False),)
-            told = dict.fromkeys(group.each(), _STEP)
+            pending = dict.fromkeys(group.each(), _STEP)
             data = _encoded(group.worker, "step", group.rows, payload, together)
-            commands.append((group, told, data))
-        self._tell(commands)
+            commands.append((group, pending, data))
+        self._send_commands(commands)
 
     def reset(
         self,
@@ -125,12 +128,12 @@ class Dispatcher:
                 for row, position in zip(group.each(), group.positions, strict=True)
             }
             commands.append((group, told, _reset_command(group.worker, group.rows, told)))
-        self._tell(commands)
+        self._send_commands(commands)
 
     def call(
         self, numbers: Sequence[int], method: str, arguments: Sequence[tuple[Any, ...]]
     ) -> None:
-        """Have ``Slot.method(*arguments)`` called, with arguments for each environment."""
+        """Call ``Slot.method(*arguments)``, with arguments for each environment."""
         self._move_idle_workers()
         self._wait(self._all_there, None)
         groups = self._groups(numbers)
@@ -143,7 +146,7 @@ class Dispatcher:
         for group in groups:
             group.worker.results = None
         self._calls = groups
-        self._tell(commands)
+        self._send_commands(commands)
 
     # Answers
 
@@ -201,10 +204,10 @@ class Dispatcher:
     def _all_there(self) -> bool:
         return all(worker.hello or worker.error for worker in self._workers)
 
-    # Telling
+    # Sending
 
     def _groups(self, numbers: Sequence[int] | None) -> list[_CommandPart]:
-        """A command's parts, by worker; raises what became of one that is there no more."""
+        """Return the parts of a command, by worker; raise the error of a worker given up."""
         if numbers is None:
             groups = [_CommandPart(worker, None, worker.numbers) for worker in self._workers]
         else:
@@ -220,12 +223,12 @@ class Dispatcher:
                 raise fresh(group.worker.error)
         return groups
 
-    def _tell(
+    def _send_commands(
         self, commands: Iterable[tuple[_CommandPart, dict[int, PendingCommand], bytes]]
     ) -> None:
-        for group, told, data in commands:
-            group.worker.pending.update(told)
-            # One that is being started anew is told once it has begun.
+        for group, pending, data in commands:
+            group.worker.pending.update(pending)
+            # A worker that is being started gets its commands in ``_resume``.
             if group.worker.hello is not None:
                 self._send(group.worker, data)
 
@@ -234,7 +237,7 @@ class Dispatcher:
         worker.set_deadline()
 
     def _begin(self, worker: WorkerProcess) -> None:
-        """Tell a worker that has its environments where the arrays are."""
+        """Send the arrays to a worker that has made its environments."""
         memory = self._memory if self._shares(worker) else None
         shape = self._shape if memory else self._shape._replace(num_envs=len(worker.numbers))
         last = worker.arrays.pack(slice(None), shared=bool(memory)) if worker.lost else None
@@ -245,41 +248,41 @@ class Dispatcher:
         memory, hello = self._memory, worker.hello
         return memory is not None and hello is not None and hello.host == memory.host
 
-    # Hearing
+    # Receiving
 
     def _wait(self, enough: Callable[[], bool], timeout: float | None) -> None:
-        """Until ``enough``; raises what has failed."""
+        """Wait until ``enough``; raise the first failure."""
         deadline = None if timeout is None else time.monotonic() + timeout
         while not enough():
             left = DOZE if deadline is None else min(DOZE, deadline - time.monotonic())
             if left < 0:
                 raise WaitedTooLong(f"not all environments answered within {timeout:g} s")
-            heard = self._workers.receive(left)
-            for worker, message in heard:
-                self._hear(worker, message)
+            received = self._workers.receive(left)
+            for worker, message in received:
+                self._on_message(worker, message)
             for each in self._workers:
                 each.kill_if_stuck()
-            if not heard:  # else a step is being made, which is not to be held up
+            if not received:  # else a step is in progress, which a move would delay
                 self._move_idle_workers()
         self._raise_failure()
 
-    def _hear(self, worker: WorkerProcess, message: Any) -> None:
+    def _on_message(self, worker: WorkerProcess, message: Any) -> None:
         match message:
             case Ended():
-                self._mourn(worker)
+                self._on_process_end(worker)
             case WorkerHello():
                 worker.hello = message
                 if self._begun:
-                    self._stand_in(worker)
+                    self._resume(worker)
             case EnvironmentFailure():
-                self._lose(worker, self._told(worker, message)[1])
+                self._lose(worker, self._numbered(worker, message)[1])
             case Unreadable():
                 self._blame(worker, message.error)
             case Answer() | Results():
                 if not _only_reports_losses(message):
                     worker.deaths = worker.disruptions = 0
                 if message.generation == worker.generation:
-                    self._failures += [self._told(worker, each) for each in message.failures]
+                    self._failures += [self._numbered(worker, each) for each in message.failures]
                     if isinstance(message, Answer):
                         self._answer(worker, message)
                     else:
@@ -301,21 +304,23 @@ class Dispatcher:
         for note in answer.notes:
             self._notes[first + note.row] = note
             if note.lost not in (None, worker.lost):
-                self._warn(f"environment {first + note.row} made anew: {note.lost}")
+                self._warn(f"environment {first + note.row} replaced: {note.lost}")
         worker.set_deadline()
 
     def _blame(self, worker: WorkerProcess, error: Exception) -> None:
-        """Note an answer that cannot be unpickled.  Its environments are not known."""
+        """Note an answer that cannot be unpickled, whose environments are unknown."""
         whose = f"{worker.whose()}, of worker {worker.name!r},"
         add_note(error, f"an answer of {whose} cannot be unpickled")
         if worker.hello is None:
             self._lose(worker, error)
             return
         worker.results = []
-        worker.give_up()  # what it has yet to say of its other environments, too
+        worker.give_up()  # also the later answers to these commands
         self._failures.append((worker.setup.first, error))
 
-    def _told(self, worker: WorkerProcess, failure: EnvironmentFailure) -> tuple[int, Exception]:
+    def _numbered(
+        self, worker: WorkerProcess, failure: EnvironmentFailure
+    ) -> tuple[int, Exception]:
         number = worker.setup.first + failure.row
         return number, failure.exception(self.name(number))
 
@@ -330,27 +335,27 @@ class Dispatcher:
 
     # Ends
 
-    def _mourn(self, worker: WorkerProcess) -> None:
+    def _on_process_end(self, worker: WorkerProcess) -> None:
         """Note that the process of a worker has ended."""
         if worker.error is not None:
-            return  # it said why
+            return  # it sent the reason before
         error = worker.death(self._at_work(worker))
-        if not self._may_be_made_anew(worker):
+        if not self._may_be_replaced(worker):
             self._lose(worker, error)
             return
         if self._is_called(worker):
-            # It is not known which methods of the call ran.
+            # The methods of the call that have run are unknown.
             worker.results = []
             self._failures.append((worker.setup.first, error))
-        self._warn(f"{worker.whose()} made anew: {error}")
-        self._make_anew(worker, self._workers.drop, str(error), error)
+        self._warn(f"{worker.whose()} replaced: {error}")
+        self._restart_process(worker, self._workers.drop, str(error), error)
 
-    def _may_be_made_anew(self, worker: WorkerProcess) -> bool:
+    def _may_be_replaced(self, worker: WorkerProcess) -> bool:
         if worker.disrupted:
             return worker.disruptions <= self._disruptions
         return self._begun and self._restart and worker.deaths <= ATTEMPTS
 
-    def _make_anew(
+    def _restart_process(
         self,
         worker: WorkerProcess,
         let_go: Callable[[WorkerProcess], None],
@@ -378,7 +383,7 @@ class Dispatcher:
         self._failures.append((worker.setup.first, error))
 
     def _move_idle_workers(self) -> None:
-        """Move workers whose hosts are about to go, once they have answered all."""
+        """Move workers whose hosts are ending, once they have answered all commands."""
         for worker in self._workers:
             if worker.hello is None or worker.pending or worker.error is not None:
                 continue
@@ -387,15 +392,15 @@ class Dispatcher:
 
     def _move(self, worker: WorkerProcess, why: str) -> None:
         if worker.disruptions >= self._disruptions:
-            return  # it stays until it is ended, which its error tells of
+            return  # it stays until the host ends; its error then says so
         lost = f"the host of worker {worker.name!r} is about to go: {why}"
-        self._warn(f"{worker.whose()} made anew: {lost}")
+        self._warn(f"{worker.whose()} replaced: {lost}")
         worker.disruptions += 1
         error = StartError(f"worker {worker.name!r} on another host", lost)
-        self._make_anew(worker, self._workers.release, lost, error)
+        self._restart_process(worker, self._workers.release, lost, error)
 
     def _at_work(self, worker: WorkerProcess) -> int | None:
-        """The row that a worker of this host was busy with."""
+        """Return the row that a worker of this host was busy with; None if unknown."""
         if not self._begun or not self._shares(worker):
             return None
         at_work = self._arrays.at_work
@@ -403,13 +408,13 @@ class Dispatcher:
         at_work[worker.setup.worker] = 0
         return None if row < 0 else row
 
-    def _stand_in(self, worker: WorkerProcess) -> None:
-        """A new process has its environments: tell it what the one before was told."""
+    def _resume(self, worker: WorkerProcess) -> None:
+        """Send a new process the commands that the one before has not answered."""
         self._begin(worker)
         steps = [row for row, told in worker.pending.items() if told is _STEP]
         resets = {row: told for row, told in worker.pending.items() if told is not _STEP}
         if steps:
-            # Their episodes are lost, and no action goes on with them.
+            # These episodes are lost, so the steps need no actions.
             self._send(worker, _encoded(worker, "step", steps, [None] * len(steps), False))
         if resets:
             self._send(worker, _reset_command(worker, list(resets), resets))
@@ -432,7 +437,7 @@ def _reset_command(
 
 
 def _only_reports_losses(message: Answer | Results) -> bool:
-    """Tell whether the environments only reported that their episodes were lost."""
+    """Return whether the environments only reported lost episodes."""
     if not isinstance(message, Answer) or message.rows is None:
         return False
     return all(note.lost for note in message.notes) and len(message.notes) == len(message.rows)
@@ -452,7 +457,7 @@ class _CommandPart(NamedTuple):
 
 
 class SubEnvironments:
-    """Workers with their environments, the arrays of a step, and the spaces of both."""
+    """Workers with their environments, their spaces, and the arrays of a step."""
 
     def __init__(
         self,
@@ -481,7 +486,7 @@ class SubEnvironments:
         wanted = cpu.cpu_count() if num_workers is None else num_workers
         setups = [
             Setup(index, rows.start, env_fns[rows], autoreset, on_error == "restart", timeout)
-            for index, rows in enumerate(_divided(count, min(wanted, count)))
+            for index, rows in enumerate(_slices(count, min(wanted, count)))
         ]
         chosen = fiber.get_context(context)
         workers = [WorkerProcess(setup, chosen, owner) for setup in setups]
@@ -542,7 +547,7 @@ class SubEnvironments:
 
     def close(self, timeout: float | None) -> None:
         """End the workers; kill those that have not ended when ``timeout`` is over."""
-        if os.getpid() == self._owner:  # else nothing of the workers is here to end
+        if os.getpid() == self._owner:  # a forked copy has no workers
             self.dispatcher.close(timeout)
 
     def discard(self) -> None:
@@ -551,15 +556,15 @@ class SubEnvironments:
             self.close(0)
 
     def check_owner(self) -> None:
-        """RuntimeError in another process than that which made them."""
+        """Raise RuntimeError in another process than the one that made this object."""
         if os.getpid() != self._owner:
             raise RuntimeError(
-                f"this vector environment belongs to process {self._owner}: a copy of it that came "
-                "here by a fork has no workers; make one in this process"
+                f"this vector environment belongs to process {self._owner}: its copy in a forked "
+                "process has no workers. Make one in this process"
             )
 
 
-def _divided(count: int, parts: int) -> Iterator[slice]:
-    """So many pieces, as equal as can be, of so many environments."""
+def _slices(count: int, parts: int) -> Iterator[slice]:
+    """Yield ``parts`` slices of ``count`` environments, as equal as possible."""
     for part in range(parts):
         yield slice(count * part // parts, count * (part + 1) // parts)

@@ -1,4 +1,4 @@
-"""Environment in its worker: it steps, resets itself after an episode, and is made anew."""
+"""Environment in its worker, with its steps, its automatic resets and its replacement."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Note(NamedTuple):
     info: dict[str, Any]
     final: Final | None = None
     lost: str | None = None
-    """Reason why the environment was made anew and its episode cut short."""
+    """Reason why the environment was replaced and its episode ended early."""
 
 
 class Slot:
@@ -75,7 +75,7 @@ class Slot:
         return self.env.get_wrapper_attr(name)
 
     def has_attr(self, name: str) -> bool:
-        """Tell whether a wrapper or the environment has an attribute."""
+        """Return whether a wrapper or the environment has an attribute."""
         return self.env.has_wrapper_attr(name)
 
     def set_wrapper_attr(self, name: str, value: Any) -> None:
@@ -87,7 +87,7 @@ class Slot:
         setattr(self.env, name, value)
 
     def is_wrapped(self, wrapper_class: type[Wrapper[Any, Any, Any, Any]]) -> bool:
-        """Tell whether a wrapper of this class is around the environment."""
+        """Return whether a wrapper of this class is around the environment."""
         env = self.env
         while isinstance(env, Wrapper) and not isinstance(env, wrapper_class):
             env = env.env
@@ -101,12 +101,12 @@ class Slot:
         """Note that the episode of the environment is lost."""
         self._lost = why
 
-    def make_anew(self, why: str) -> None:
+    def replace_env(self, why: str) -> None:
         """Replace the environment by a new one.  Its episode is lost."""
         try:
             self.env.close()
         except Exception:
-            pass  # it had failed before, and is dropped now
+            pass  # it had failed before
         self.env = self._make()
         self.lose(why)
 
@@ -138,7 +138,7 @@ class Slot:
         return self._note(info)
 
     def _truncate(self, arrays: StepArrays) -> Note | None:
-        """The end of an episode whose environment is gone: where it was seen last."""
+        """End the episode of a lost environment, with the last observation."""
         lost, last = self._lost, arrays.observations.get(self.row)
         if self._same_step:
             observation, info = self.env.reset()

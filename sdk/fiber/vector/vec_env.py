@@ -23,18 +23,18 @@ Indices = int | Sequence[int] | None
 
 
 class VecEnv(vec_env.VecEnv):
-    """Steps many environments in Fiber processes: on this host, or on pods.
+    """Vector environment whose environments are in Fiber processes: on this host, or on pods.
 
-    What it returns is what stable-baselines3's ``DummyVecEnv`` of the same ``env_fns`` returns, for
-    the same seeds and actions.  It takes the place of ``SubprocVecEnv``, also as ``vec_env_cls`` of
+    It returns what stable-baselines3's ``DummyVecEnv`` of the same ``env_fns`` returns, for the
+    same seeds and actions.  It replaces ``SubprocVecEnv``, also as ``vec_env_cls`` of
     ``make_vec_env``.
 
     * ``start_method``: as of ``fiber.get_context()``.
     * ``num_workers`` processes, by default ``fiber.cpu_count()``, share the environments.
     * ``shared_memory``: on one host actions and observations lie in memory that the processes
-      share; on other hosts they travel, those of a worker in one message.
+      share.  Other hosts get them in messages, one for each worker.
     * ``on_error`` and ``timeout`` are those of ``fiber.vector.VectorEnv``: an environment that was
-      made anew reports the end of an episode, and ``info["restarted"]`` says why.
+      replaced reports the end of an episode, and ``info["restarted"]`` says why.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class VecEnv(vec_env.VecEnv):
         on_error: str = "raise",
         timeout: float | None = None,
     ) -> None:
-        self.closed = True  # until there is something to close
+        self.closed = True  # until the workers exist
         self.waiting = False
         self._sub_environments = SubEnvironments(
             [with_resources(partial(_make, make), resources_of(make)) for make in env_fns],
@@ -55,7 +55,7 @@ class VecEnv(vec_env.VecEnv):
             num_workers=num_workers,
             shared_memory=shared_memory,
             context=start_method,
-            observation_mode="different",  # as far as DummyVecEnv goes: the first one's is for all
+            observation_mode="different",  # as in DummyVecEnv, the first space is used for all
             autoreset=AutoresetMode.SAME_STEP,
             on_error=on_error,
             timeout=timeout,
@@ -68,7 +68,7 @@ class VecEnv(vec_env.VecEnv):
         self.metadata = self._sub_environments.metadata
 
     def reset(self) -> Any:
-        """Reset all environments; observations.  A step that is under way is given up."""
+        """Reset all environments; return observations.  A step in progress is given up."""
         self._give_up()
         options = [each or None for each in self._options]
         self._dispatcher.reset(None, self._seeds, options)
@@ -82,7 +82,7 @@ class VecEnv(vec_env.VecEnv):
         return self._observations()
 
     def step_async(self, actions: Any) -> None:
-        """Begin to step all environments: for ``step_wait``."""
+        """Begin to step all environments.  ``step_wait`` returns the result."""
         self._check_open()
         if self.waiting:
             raise AlreadyPendingCallError("step_async() before the last one's step_wait()", "step")
@@ -92,7 +92,7 @@ class VecEnv(vec_env.VecEnv):
     def step_wait(
         self,
     ) -> tuple[Any, npt.NDArray[np.float32], npt.NDArray[np.bool_], list[dict[str, Any]]]:
-        """Observations, rewards, whether episodes are over, and infos."""
+        """Return observations, rewards, ends of episodes, and infos."""
         if not self.waiting:
             raise NoAsyncCallError("step_wait() without a step_async() before", "step")
         self._wait()
@@ -120,14 +120,14 @@ class VecEnv(vec_env.VecEnv):
         """Close the environments and end their processes."""
         if not self.closed:
             self._sub_environments.close(None)
-            self.closed = True  # now: Ctrl-C may have come before
+            self.closed = True  # last: Ctrl-C may interrupt the close
 
     def __del__(self) -> None:
         if not getattr(self, "closed", True):
             self._sub_environments.discard()
 
     def get_images(self) -> Sequence[npt.NDArray[np.uint8] | None]:
-        """A frame of each environment, if its render mode is rgb_array."""
+        """Return a frame of each environment, if its render mode is rgb_array."""
         if self.render_mode != "rgb_array":
             warnings.warn(
                 f"The render mode is {self.render_mode}, but images need `rgb_array`", stacklevel=2
@@ -136,7 +136,7 @@ class VecEnv(vec_env.VecEnv):
         return self.env_method("render")
 
     def has_attr(self, attr_name: str) -> bool:
-        """Tell whether all environments have an attribute."""
+        """Return whether all environments have an attribute."""
         return all(self._call("has_attr", None, attr_name))
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
@@ -156,14 +156,14 @@ class VecEnv(vec_env.VecEnv):
     def env_is_wrapped(
         self, wrapper_class: type[gymnasium.Wrapper[Any, Any, Any, Any]], indices: Indices = None
     ) -> list[bool]:
-        """Tell of each environment whether a wrapper of this class is around it."""
+        """Return for each environment whether a wrapper of this class is around it."""
         return self._call("is_wrapped", indices, wrapper_class)
 
     def _call(self, method: str, indices: Indices, *arguments: Any) -> list[Any]:
         self._check_open()
         if self.waiting:
             raise AlreadyPendingCallError("a call before step_wait()", "step")
-        # From the end they are counted, too.
+        # Negative indices count from the end.
         numbers = [range(self.num_envs)[index] for index in self._get_indices(indices)]
         self._dispatcher.call(numbers, method, [arguments] * len(numbers))
         results: list[Any] = self._waited(self._dispatcher.results)
@@ -202,7 +202,7 @@ def _make(make: Callable[[], Any]) -> gymnasium.Env[Any, Any]:
     """Make an environment, in its worker."""
     env: Any = make()
     if not isinstance(env, gymnasium.Env):
-        # One of the old gym. Not imported for others: it takes seconds, as torch comes with it.
+        # An environment of the old gym.  The import takes seconds, because it loads torch.
         from stable_baselines3.common.vec_env.patch_gym import _patch_env
 
         env = _patch_env(env)

@@ -36,31 +36,31 @@ Step: TypeAlias = tuple[
 
 
 class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
-    """Steps many environments in Fiber processes: on this host, or on pods.
+    """Vector environment whose environments are in Fiber processes: on this host, or on pods.
 
-    What it returns is what Gymnasium's ``SyncVectorEnv`` of the same ``env_fns`` returns, for the
-    same seeds and actions.  It has the methods of ``AsyncVectorEnv`` (``step_async`` and its like),
-    and ``send`` and ``recv`` for those who do not wait for the slowest.
+    It returns what Gymnasium's ``SyncVectorEnv`` of the same ``env_fns`` returns, for the same
+    seeds and actions.  It has the methods of ``AsyncVectorEnv``, such as ``step_async``.  With
+    ``send`` and ``recv`` a learner does not wait for the slowest environment.
 
     * ``num_workers`` processes, by default ``fiber.cpu_count()``, share the environments.
     * ``shared_memory``: on one host actions and observations lie in memory that the processes
-      share; on other hosts they travel, those of a worker in one message.
+      share.  Other hosts get them in messages, one for each worker.
     * ``copy``: observations are the caller's.  Otherwise the next step overwrites them.
-    * On Kubernetes a worker's pod has what ``fiber.meta`` says that its ``env_fns`` need: of each
-      resource the most that one of them asks for.
+    * On Kubernetes a worker's pod has the resources that ``fiber.meta`` sets for its ``env_fns``:
+      of each resource the most that one of them asks for.
     * ``context`` is a start method, as of ``fiber.get_context()``.
     * ``observation_mode`` and ``autoreset_mode`` are ``AsyncVectorEnv``'s.
     * ``on_error="restart"``: an environment that raises, takes longer than ``timeout`` or whose
-      worker dies is made anew, with a RuntimeWarning, and the others' step goes on.  Its episode is
+      worker dies is replaced, with a RuntimeWarning, and the others' step goes on.  Its episode is
       reported as truncated, with reward 0 and ``infos["restarted"]`` saying why, and goes on as
       after any end of an episode.  By default the error is raised: it is what the environment
       raised, ``WorkerDied`` or ``multiprocessing.TimeoutError``, and names the environment and its
-      worker.  Environments whose pod the cluster ends, by a drain for instance, are made anew on
+      worker.  Environments whose pod the cluster ends, by a drain for instance, are replaced on
       another one in either case, at most ``disruptions`` times in a row (``fiber.init``).
     * ``timeout``: seconds that the making, a step or a reset of one environment may take.  It is
-      kept by an alarm in the worker (SIGALRM); a worker whose native code does not return to the
-      interpreter from a step or a reset is killed a little later.  From the making it may return
-      as late as it likes: that is waited for.
+      kept by an alarm in the worker (SIGALRM).  If native code blocks the interpreter in a step or
+      a reset, the worker is killed a little later.  The making is waited for without a limit
+      then.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
         on_error: str = "raise",
         timeout: float | None = None,
     ) -> None:
-        self.closed = True  # until there is something to close
+        self.closed = True  # until the workers exist
         self.copy = copy
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self._sub_environments = sub_environments = SubEnvironments(
@@ -101,19 +101,19 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
         self._dispatcher = sub_environments.dispatcher
         self._state = AsyncState.DEFAULT
         self._received: Sequence[int] | None = None
-        """The environments of the last ``recv``; None: all."""
+        """Environments of the last ``recv``; None for all."""
         self.closed = False
 
-    # Gymnasium's
+    # Gymnasium's interface
 
     @property
     def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
-        """The seed of each environment."""
+        """Seed of each environment."""
         return self.get_attr("np_random_seed")
 
     @property  # type: ignore[misc]  # it cannot be set here, as in AsyncVectorEnv
     def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
-        """A copy of each environment's generator."""
+        """Copy of each environment's generator."""
         return self.get_attr("np_random")
 
     def reset(
@@ -122,9 +122,10 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Any, dict[str, Any]]:
-        """Reset all environments, or those of ``options["reset_mask"]``; observations and infos.
+        """Reset all environments, or those of ``options["reset_mask"]``.
 
-        A ``seed`` that is a number is the first environment's, and the next one's is one more.
+        Return observations and infos.  If ``seed`` is a number, the first environment gets it, and
+        each next environment gets one more.
         """
         with self._given_up_if_interrupted():
             self.reset_async(seed, options)
@@ -135,7 +136,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> None:
-        """Begin to reset: for ``reset_wait`` or ``recv``."""
+        """Begin to reset.  ``reset_wait`` or ``recv`` returns the result."""
         self._check_idle("reset_async")
         seeds = self._seeds(seed)
         mask, options = _without_mask(options, self.num_envs)
@@ -152,9 +153,9 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
         return self._observations(), self._infos(self._dispatcher.notes())
 
     def step(self, actions: Any) -> Step:
-        """Step all environments: observations, rewards, terminations, truncations and infos.
+        """Step all environments; return observations, rewards, terminations, truncations, infos.
 
-        If it is interrupted (Ctrl-C), the step is given up: its results are not returned.
+        After an interruption (Ctrl-C), the results of the step are dropped.
         """
         with self._given_up_if_interrupted():
             self.step_async(actions)
@@ -179,12 +180,12 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
             self._infos(self._dispatcher.notes()),
         )
 
-    # First ready
+    # Environments that are ready first
 
     def send(self, actions: Any, env_ids: Sequence[int] | Numbers | None = None) -> None:
-        """Begin to step the environments ``env_ids``, one action for each.
+        """Begin to step the environments ``env_ids``, with one action for each.
 
-        By default those of the last ``recv``, or all after ``reset`` or ``step``.
+        The default is those of the last ``recv``, or all after ``reset`` or ``step``.
         """
         self._check_running()
         numbers = self._chosen(env_ids)
@@ -194,17 +195,17 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
     def recv(self, batch_size: int | None = None, timeout: float | None = None) -> Step:
         """Return the results of ``step`` of the ``batch_size`` environments that are ready first.
 
-        ``infos["env_id"]`` has their numbers.  All else has its rows in the same order.  By default
-        it waits for all environments that are stepping or resetting.  TimeoutError after
-        ``timeout`` seconds: then nothing is lost, and the next ``recv`` goes on.
+        ``infos["env_id"]`` has their numbers.  All arrays have their rows in the same order.  By
+        default it waits for all environments that are stepping or resetting.  TimeoutError after
+        ``timeout`` seconds: no result is lost, and the next ``recv`` continues.
         """
         self._check_running()
         under_way = self._dispatcher.under_way()
         count = under_way if batch_size is None else batch_size
         if not 0 < count <= under_way:
             raise ValueError(
-                f"recv({batch_size}) would wait for ever: {under_way} environments were told to "
-                "reset or step and not received yet. Call reset_async() or send() first"
+                f"recv({batch_size}) would wait for ever: {under_way} environments are stepping or "
+                "resetting, or were not received yet. Call reset_async() or send() first"
             )
         self._state = AsyncState.DEFAULT
         with self._given_up_if_interrupted():
@@ -265,7 +266,8 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
     def close_extras(self, timeout: float | None = None, terminate: bool = False) -> None:
         """Close the environments and end their processes.
 
-        Those that have not ended after ``timeout`` seconds are killed; ``terminate``: all, at once.
+        Processes that have not ended after ``timeout`` seconds are killed.  ``terminate``: kill all
+        at once.
         """
         state = self._state
         if state is not AsyncState.DEFAULT:
@@ -279,7 +281,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
         if not self.closed and hasattr(self, "_sub_environments"):
             self._sub_environments.discard()
 
-    # What they have in common
+    # Parts of all of them
 
     def _call(self, method: str, arguments: Sequence[tuple[Any, ...]]) -> None:
         with self._given_up_if_interrupted():
@@ -341,8 +343,8 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
         busy = self._dispatcher.busy(numbers)
         if busy is not None:
             raise AlreadyPendingCallError(
-                f"environment {busy} was told something before, and what came of it was not "
-                "received yet: it can be sent its next action once recv() returned it",
+                f"environment {busy} has a command whose result was not received yet: send its "
+                "next action once recv() has returned it",
                 "send",
             )
         return numbers
@@ -352,7 +354,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
             raise ClosedEnvironmentError(f"this {type(self).__name__} is closed")
         self._sub_environments.check_owner()
 
-    # What these two say is Gymnasium's interface: its tests look for the words.
+    # The messages of these two are Gymnasium's: its tests check the words.
 
     def _check_idle(self, doing: str) -> None:
         self._check_running()
@@ -390,7 +392,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
 
     @contextlib.contextmanager
     def _given_up_if_interrupted(self) -> Iterator[None]:
-        """Give up the command if the block is interrupted: its state is not known then."""
+        """Give up the command if the block is interrupted, since its state is unknown then."""
         try:
             yield
         except (KeyboardInterrupt, SystemExit):
@@ -405,7 +407,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
 def _with_note(
     batch: gymnasium.vector.VectorEnv[Any, Any, Any], infos: dict[str, Any], note: Note, row: int
 ) -> dict[str, Any]:
-    """The infos of a batch with those of one more environment, in its row."""
+    """Return the infos of a batch with those of one more environment, in its row."""
     if note.final is not None:
         ending = {"final_obs": note.final.observation, "final_info": note.final.info}
         infos = batch._add_info(infos, ending, row)
@@ -417,11 +419,11 @@ def _with_note(
 def _without_mask(
     options: dict[str, Any] | None, count: int
 ) -> tuple[npt.NDArray[np.bool_] | None, dict[str, Any] | None]:
-    """``options["reset_mask"]``, and the options without it."""
+    """Return ``options["reset_mask"]``, and the options without it."""
     if options is None or "reset_mask" not in options:
         return None, options
     mask = options["reset_mask"]
-    # The words are Gymnasium's: its tests look for them.
+    # The words are Gymnasium's: its tests check them.
     if not isinstance(mask, np.ndarray):
         raise TypeError(f"`options['reset_mask']` must be a numpy array, got {type(mask)}")
     if mask.shape != (count,):
@@ -444,8 +446,7 @@ def make_vec(
     wrappers: Sequence[Callable[[gymnasium.Env[Any, Any]], gymnasium.Env[Any, Any]]] = (),
     **kwargs: Any,
 ) -> VectorEnv:
-    """A ``VectorEnv`` of a registered environment: as ``gymnasium.make_vec`` would make it, if it
-    had a vectorization mode for Fiber.
+    """Return a ``VectorEnv`` of a registered environment, as ``gymnasium.make_vec`` would.
 
     ``vector_kwargs`` are ``VectorEnv``'s options, ``wrappers`` are put around each environment, and
     ``kwargs`` are those of ``gymnasium.make``.
@@ -455,7 +456,7 @@ def make_vec(
 
 
 def register(id: str, **vector_kwargs: Any) -> None:
-    """Have ``gymnasium.make_vec`` make a ``VectorEnv`` of this environment.
+    """Make ``gymnasium.make_vec`` return a ``VectorEnv`` for this environment.
 
     From then on ``gymnasium.make_vec(id, num_envs)`` and its ``vectorization_mode=
     "vector_entry_point"`` do so in this process, also if the environment came with another vector

@@ -1,7 +1,7 @@
 """Worker: a process that steps many environments by command.
 
 A command is a tuple ``(operation, generation, rows, ...)``.  With ``together`` it has one answer.
-Else it may have several, so that finished environments do not wait for a slow one.
+Otherwise it may have several, so that finished environments do not wait for a slow one.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Setup(NamedTuple):
     makes: Sequence[MakeEnv]
     autoreset: AutoresetMode
     restart: bool
-    """True if an environment that raises is made anew."""
+    """True if an environment that raises is replaced."""
     timeout: float | None
     """Seconds for the making, a step or a reset of one environment."""
 
@@ -104,13 +104,13 @@ def serve(connection: Connection, setup: Setup) -> None:
     except (EOFError, BrokenPipeError):
         pass  # the learner has ended, or has closed the environments
     finally:
-        with contextlib.ExitStack() as ends:  # all are closed, also if one raises
+        with contextlib.ExitStack() as ends:  # closes all, also if one raises
             for slot in reversed(slots):
                 ends.callback(slot.close)
 
 
 def _make_all(connection: Connection, setup: Setup, slots: list[Slot]) -> bool:
-    """Make the environments and say hello; False if one could not be made."""
+    """Make the environments and send WorkerHello; return False if one could not be made."""
     limit = _limit(setup)
     made: set[int] = set()
     spaces: list[tuple[Any, Any]] = []
@@ -118,7 +118,7 @@ def _make_all(connection: Connection, setup: Setup, slots: list[Slot]) -> bool:
         try:
             with limit:
                 slots.append(Slot(row, make, setup.autoreset))
-                _check_that_it_is_new(slots[-1], made)
+                _check_new(slots[-1], made)
                 spaces.append((slots[row].env.observation_space, slots[row].env.action_space))
         except Exception as error:
             connection.send(EnvironmentFailure.of(row, "the making", error))
@@ -149,8 +149,8 @@ class EnvironmentWorker:
         self._expected = [0.0] * len(slots)
         """Expected seconds of a step of each environment: a moving average."""
         self._losses: dict[int, int] = {}
-        """Times in a row that an environment was made anew and has done nothing, by row."""
-        self._limit = _limit(setup)  # after the making, which may have set another alarm
+        """Times in a row that an environment was replaced without a success, by row."""
+        self._limit = _limit(setup)  # after the environments, which may have set another alarm
         self._shared = begin.memory is not None
         self._report_after = REPORT_AFTER if self._shared else REPORT_AFTER_ELSEWHERE
         if begin.memory is None:
@@ -159,7 +159,7 @@ class EnvironmentWorker:
             arrays = StepArrays.of_memory(begin.shape, begin.memory.view)
             self._arrays = arrays.part(setup.first, len(slots))
         self._arrays.unpack(slice(None), begin.last)
-        # In private arrays no other process reads it.
+        # If the arrays are private, no other process reads it.
         self._at_work = self._arrays.at_work
         if begin.lost is not None:
             for slot in slots:
@@ -176,7 +176,7 @@ class EnvironmentWorker:
             operation, *arguments = self._connection.recv()
             self._operations[operation](*arguments)
 
-    def _tell(self, message: Answer | Results) -> None:
+    def _send_unconfirmed(self, message: Answer | Results) -> None:
         # The next command shows that the message has arrived.
         self._connection._send_unconfirmed(message)
 
@@ -234,12 +234,12 @@ class EnvironmentWorker:
                 failures.append(EnvironmentFailure.of(row, "a call", error))
         at_work[worker] = 0
         try:
-            self._tell(Results(generation, in_band(list(values.values())), failures))
-        except Exception:  # of any class: an answer cannot be pickled
+            self._send_unconfirmed(Results(generation, in_band(list(values.values())), failures))
+        except Exception:  # pickling an answer may raise any class
             for row, refusal in _refused(values.items()):
                 del values[row]
                 failures.append(EnvironmentFailure.of(row, _UNPICKLABLE, refusal))
-            self._tell(Results(generation, in_band(list(values.values())), failures))
+            self._send_unconfirmed(Results(generation, in_band(list(values.values())), failures))
 
     # Parts of all operations
 
@@ -294,13 +294,13 @@ class EnvironmentWorker:
         report: _Report,
         failed: str = "",
     ) -> None:
-        """Try again with a new environment, if that is wished; else report the failure."""
+        """Try again with a new environment if ``restart`` is set, else report the failure."""
         losses = self._losses.get(row, 0) + 1
         if self._setup.restart and losses <= ATTEMPTS:
             self._losses[row] = losses
             try:
                 with self._limit:
-                    self._slots[row].make_anew(f"{doing} raised {summary(error)}")
+                    self._slots[row].replace_env(f"{doing} raised {summary(error)}")
                 with self._limit:
                     note = operation(row)
             except Exception as again:
@@ -321,9 +321,11 @@ class EnvironmentWorker:
     ) -> None:
         while True:
             try:
-                self._tell(report.answer(self._arrays, whole=whole, shared=self._shared))
+                self._send_unconfirmed(
+                    report.answer(self._arrays, whole=whole, shared=self._shared)
+                )
                 return
-            except Exception:  # of any class: an answer cannot be pickled
+            except Exception:  # pickling an answer may raise any class
                 whole = False
                 refused = self._refused(report)
                 if not refused:
@@ -374,12 +376,12 @@ class _Report:
         return Answer(self.generation, rows, packed, notes, self.failures)
 
 
-def _check_that_it_is_new(slot: Slot, made: set[int]) -> None:
+def _check_new(slot: Slot, made: set[int]) -> None:
     """Refuse an environment whose id is in ``made``: the ids of those that were made before."""
     newest = id(slot.env.unwrapped)
     if newest in made:
         raise ValueError(
-            "it is the environment that the function has made before: have it make a new one at "
+            "the function returned an environment that it had returned before: make a new one at "
             "every call (`lambda: gymnasium.make(...)` instead of `lambda: env`)"
         )
     made.add(newest)
@@ -409,7 +411,7 @@ def _pickles(obj: object) -> bool:
 
 
 ATTEMPTS = 3
-"""Number of times in a row that an environment is made anew without having done anything."""
+"""Number of times in a row that an environment is replaced without a success."""
 
 
 class EnvironmentFailure(NamedTuple):
@@ -441,8 +443,8 @@ class TimeLimit:
     """Context that raises ``multiprocessing.TimeoutError`` in a block that takes too long.
 
     It uses an alarm (SIGALRM).  So it works only in a main thread, and only while Python code runs
-    or a system call waits: it does not end native code that never returns.  The alarm is repeated,
-    since the block may have caught the error.
+    or a system call waits.  It cannot end native code that never returns.  The alarm is repeated,
+    because the block may have caught the error.
     """
 
     def __init__(self, seconds: float) -> None:
@@ -455,7 +457,7 @@ class TimeLimit:
         signal.setitimer(signal.ITIMER_REAL, self._seconds, self._seconds)
 
     def __exit__(self, *_: object) -> None:
-        self._inside = False  # first: an alarm may strike yet
+        self._inside = False  # first: an alarm may still ring
         signal.setitimer(signal.ITIMER_REAL, 0)
 
     def _ring(self, _signal: int, _frame: FrameType | None) -> None:

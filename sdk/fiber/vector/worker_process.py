@@ -1,4 +1,4 @@
-"""Workers on the side of the learner: each one's process, connection and commands."""
+"""Workers as the learner sees them: process, connection and commands of each."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from fiber.vector.arrays import StepArrays
 from fiber.vector.worker import Setup, WorkerHello, serve
 
 NEWS = 2.0
-"""Seconds that the news of a process's end may take after that of its connection."""
+"""Seconds from the end of a process's connection to the report of its end."""
 
 GRACE = 5.0
 """Seconds beyond the limits of its environments after which a worker counts as stuck."""
 
 LIMITS_OF_A_RESTART = 4
-"""Number of times that ``timeout`` may pass for an environment that is made anew: for its step, its
-end, the making of the new one, and the step of that.
+"""Number of times that ``timeout`` may pass for an environment that is replaced: for its step, its
+end, the making of the new one, and the step of the new one.
 """
 
 
@@ -41,7 +41,7 @@ class PendingCommand(NamedTuple):
 
 
 class WorkerProcess:
-    """Worker whose process is started anew if it dies."""
+    """Worker, whose process is replaced if it dies."""
 
     process: Process
     connection: Connection
@@ -66,9 +66,9 @@ class WorkerProcess:
         self.stuck = False
         """True if the worker was killed because its deadline had passed."""
         self.deaths = 0
-        """Number of its processes that died since the last answer, and not by the cluster."""
+        """Number of processes that died since the last answer, and not by the cluster."""
         self.disruptions = 0
-        """Number of its processes that the cluster ended, or that moved, since the last answer."""
+        """Number of processes that the cluster ended, or that moved, since the last answer."""
         self.disrupted = False
         """True if the cluster ended the process before this one."""
         self.lost: str | None = None
@@ -95,7 +95,7 @@ class WorkerProcess:
                 raise
 
     def leaving(self) -> str:
-        """Return why the host of its process is about to go; empty if the host stays."""
+        """Return why the host of the process will end; empty if the host stays."""
         popen: Any = self.process._popen
         return str(popen.leaving)
 
@@ -105,16 +105,16 @@ class WorkerProcess:
         return f"environment {first}" if first == last else f"environments {first} to {last}"
 
     def death(self, row: int | None) -> Exception:
-        """Count the end of the process, and return the error that tells of it.
+        """Count the end of the process, and return the error for it.
 
-        ``row`` was at work then, if that is known.
+        ``row``: environment that was busy; None if unknown.
         """
-        told = next(iter(self.pending.values()), None) if self.hello else None
-        doing = told.operation if told else "a call" if self.hello else "the making"
+        command = next(iter(self.pending.values()), None) if self.hello else None
+        doing = command.operation if command else "a call" if self.hello else "the making"
         whose = self.whose() if row is None else f"environment {self.numbers[row]}"
         self.process.join(NEWS)
         if self.process.exitcode is None:
-            self.process.kill()  # its connection is lost: nothing that it does reaches us
+            self.process.kill()  # without a connection its results cannot arrive
             self.process.join(NEWS)
         popen: Any = self.process._popen
         report = popen.report
@@ -125,7 +125,7 @@ class WorkerProcess:
             self.stuck = False
             lines = [
                 f"{doing} of {whose} took longer than {self.setup.timeout:g} s (timeout) for each, "
-                f"and nothing but its end stopped worker {self.name!r}"
+                f"so worker {self.name!r} was killed"
             ]
             if report and report.stack:
                 lines.append(block("Where it was:", report.stack.splitlines()))
@@ -153,17 +153,17 @@ class WorkerProcess:
 
     def set_deadline(self) -> None:
         """Set the time by which the worker must have answered the remaining commands."""
-        timeout, told = self.setup.timeout, len(self.pending)
+        timeout, count = self.setup.timeout, len(self.pending)
         self.deadline = None
-        if timeout is not None and told:
-            limits = told * (LIMITS_OF_A_RESTART if self.setup.restart else 1)
+        if timeout is not None and count:
+            limits = count * (LIMITS_OF_A_RESTART if self.setup.restart else 1)
             self.deadline = time.monotonic() + limits * timeout + GRACE
 
     def kill_if_stuck(self) -> None:
         """Kill the worker if its deadline has passed.
 
-        Mostly the worker's own alarm ends a slow environment.  That fails where native code holds
-        the interpreter, and where the process is stopped or out of reach.
+        Usually an alarm in the worker ends a slow environment.  That fails if native code blocks
+        the interpreter, and if the process is stopped or out of reach.
         """
         if self.deadline is not None and self.deadline < time.monotonic():
             self.deadline = None
@@ -172,7 +172,7 @@ class WorkerProcess:
             popen.kill_with_stack()
 
     def hang_up(self, *, kill: bool) -> None:
-        """Close the connection, at which the worker ends.  ``kill`` ends it at once."""
+        """Close the connection, so that the worker ends.  ``kill``: kill its process."""
         self.connection.close()
         if kill:
             with contextlib.suppress(ValueError):  # closed just before Ctrl-C
@@ -203,7 +203,7 @@ def end(process: Process, timeout: float | None) -> None:
 
 
 class Ended:
-    """Mark in place of a message: this process sends no more."""
+    """Mark in place of a message: the process has ended."""
 
 
 class Unreadable(NamedTuple):
@@ -213,18 +213,18 @@ class Unreadable(NamedTuple):
 
 
 class WorkerGroup:
-    """Set of workers that are started and listened to."""
+    """Group of workers with started processes, whose messages are received."""
 
     def __init__(self, workers: Sequence[WorkerProcess]) -> None:
         self._workers = workers
         self._started: list[WorkerProcess] = []
         """Workers whose process must be closed."""
         self._released: list[Process] = []
-        """Processes that were told to end while they were well."""
+        """Live processes that were asked to end."""
         self._ended: deque[WorkerProcess] = deque()
         """Workers whose end was noticed, and not reported yet."""
         self._poller = select.epoll()
-        self._heard_by: dict[int, WorkerProcess] = {}
+        self._by_descriptor: dict[int, WorkerProcess] = {}
         """Workers by descriptor."""
 
     def __iter__(self) -> Iterator[WorkerProcess]:
@@ -234,13 +234,13 @@ class WorkerGroup:
         return len(self._workers)
 
     def start(self, worker: WorkerProcess) -> None:
-        """Start a worker's process, and listen to it."""
+        """Start a worker's process, and receive its messages."""
         worker.start()
         self._started.append(worker)
         # A process that an environment has started may hold the connection open after the end of
         # the worker.  The sentinel shows that end.
         for descriptor in (worker.connection.fileno(), worker.process.sentinel):
-            self._heard_by[descriptor] = worker
+            self._by_descriptor[descriptor] = worker
             self._poller.register(descriptor, select.EPOLLIN)
 
     def drop(self, worker: WorkerProcess) -> None:
@@ -250,7 +250,7 @@ class WorkerGroup:
         self._started.remove(worker)
 
     def release(self, worker: WorkerProcess) -> None:
-        """Have a live process close its environments and end."""
+        """Ask a live process to close its environments and end."""
         self._forget(worker)
         self._ended = deque(each for each in self._ended if each is not worker)
         worker.hang_up(kill=False)
@@ -267,22 +267,22 @@ class WorkerGroup:
 
     def receive(self, timeout: float) -> list[tuple[WorkerProcess, Any]]:
         """Return messages of workers; none after ``timeout`` seconds."""
-        heard: list[tuple[WorkerProcess, Any]] = []
+        received: list[tuple[WorkerProcess, Any]] = []
         for descriptor, _ in self._poller.poll(0 if self._ended else timeout):
-            worker = self._heard_by[descriptor]
+            worker = self._by_descriptor[descriptor]
             if descriptor == worker.process.sentinel:
-                heard += [(worker, message) for message in _rest(worker)]
+                received += [(worker, message) for message in _rest(worker)]
                 self._ended.append(worker)
             elif worker not in self._ended:  # else all its messages were received already
                 try:
-                    heard.append((worker, _received(worker)))
+                    received.append((worker, _received(worker)))
                 except (EOFError, OSError):
                     self._ended.append(worker)
         while self._ended:
             worker = self._ended.popleft()
             if self._forget(worker):
-                heard.append((worker, Ended()))
-        return heard
+                received.append((worker, Ended()))
+        return received
 
     def close(self, timeout: float | None) -> None:
         """Wait until all workers have ended; kill the others after ``timeout`` seconds."""
@@ -295,7 +295,7 @@ class WorkerGroup:
             self._forget(worker)
             worker.hang_up(kill=timeout == 0)
         while self._started:
-            worker = self._started[-1]  # until it is closed: Ctrl-C may come before
+            worker = self._started[-1]  # removed after the close, which Ctrl-C may interrupt
             worker.close(left())
             self._started.pop()
         while self._released:
@@ -304,10 +304,10 @@ class WorkerGroup:
         self._poller.close()
 
     def _forget(self, worker: WorkerProcess) -> bool:
-        """Stop listening to a worker; return False if that had happened before."""
-        descriptors = [fd for fd, other in self._heard_by.items() if other is worker]
+        """Stop receiving from a worker; return False if that had happened before."""
+        descriptors = [fd for fd, other in self._by_descriptor.items() if other is worker]
         for descriptor in descriptors:
-            del self._heard_by[descriptor]
+            del self._by_descriptor[descriptor]
             self._poller.unregister(descriptor)
         return bool(descriptors)
 
@@ -317,7 +317,7 @@ def _received(worker: WorkerProcess) -> Any:
     message = worker.connection._recv_pickled()
     try:
         return packet.loads(message)
-    except Exception as error:  # an OSError, too, is that of an environment's object
+    except Exception as error:  # also an OSError, from unpickling an object
         return Unreadable(error)
 
 

@@ -1,6 +1,6 @@
-"""Pod template of a shape, and the FiberPool around it.
+"""Pod template of a shape, and the FiberPool with it.
 
-A worker finds what its program has. If the program runs in a pod, the worker's container is a copy
+Workers have what their program has. If the program runs in a pod, the worker's container is a copy
 of the program's container: image, environment, volumes, account, without the parts that belong to
 one pod. Elsewhere the configured image is used. The resources that functions ask for are added, and
 the user's own template overrides everything.
@@ -44,17 +44,17 @@ _AGENT = ("-m", "fiber.agent")
 def pod_template(
     shape: PodShape, own_pod: Mapping[str, Any] | None, container: str, python: str = "python"
 ) -> Document:
-    """The template of a shape's pods.
+    """Return the template of a shape's pods.
 
-    ``own_pod`` is the pod that this program runs in, ``container`` its container there and
-    ``python`` its interpreter; without a pod the last two have no meaning.
+    ``own_pod``: pod of this program, or None.  ``container`` and ``python``: container of the
+    program in that pod, and its interpreter there.
     """
     spec = _like(own_pod, container) if own_pod is not None else _elsewhere()
     worker = spec["containers"][0]
     own_image = worker["image"] if own_pod is not None else None
     if shape.image is not None and shape.image != worker["image"]:
         worker["image"] = shape.image
-        worker.pop("imagePullPolicy", None)  # it was said of the other
+        worker.pop("imagePullPolicy", None)  # of the image before
     _ask_for(worker, shape)
     _place(spec, shape.resources)
     if shape.shm is not None:
@@ -63,7 +63,7 @@ def pod_template(
     for worker in _workers(template):
         _request_the_rest(worker, shape)
         if not ("command" in worker or "args" in worker):
-            # What the image runs by itself may be the program, and that must not start anew.
+            # The default command of the image may be the program, which must not start again.
             interpreter = python if worker.get("image") == own_image else "python"
             worker["command"] = [interpreter, *_AGENT]
     return template
@@ -80,29 +80,29 @@ def _workers(template: Document) -> Iterator[Document]:
 
 
 def _ask_for(worker: Document, shape: PodShape) -> None:
-    """Guarantee what functions wish for each of the pod's processes: requests and limits alike."""
+    """Set requests and limits to the resources that functions ask for, for each process."""
     wishes, processes, requests = shape.resources, shape.processes_per_pod, {}
     if wishes.cpu is not None:
         requests["cpu"] = quantity(wishes.cpu * processes)
-    if wishes.memory is not None:  # what is written to /dev/shm counts to it
+    if wishes.memory is not None:  # files in /dev/shm count as memory
         requests["memory"] = f"{wishes.memory * processes + (shape.shm or 0)}Mi"
     limits = dict(requests)
     for name, amount in ((GPU, wishes.gpu or 0), *wishes.extended):
         if amount:
-            limits[name] = str(amount * processes)  # which is its request too
+            limits[name] = str(amount * processes)  # the request is the same
     if limits:
         worker["resources"] = {"limits": limits, **({"requests": requests} if requests else {})}
 
 
 def _request_the_rest(worker: Document, shape: PodShape) -> None:
-    """Request what the configuration says, of what neither a function nor the template speaks."""
+    """Add configured requests for resources that no function and no template mentions."""
     resources = worker.get("resources") or {}
     memory = shape.memory_request * shape.processes_per_pod + (shape.shm or 0)
     requests = {
         "cpu": quantity(shape.cpu_request * shape.processes_per_pod) if shape.cpu_request else "",
         "memory": f"{memory}Mi" if memory else "",
     }
-    # A limit is the request, too, if there is no other.
+    # A limit without a request is also the request.
     said = {*(resources.get("requests") or ()), *(resources.get("limits") or ())}
     added = {kind: amount for kind, amount in requests.items() if amount and kind not in said}
     if added:
@@ -111,7 +111,7 @@ def _request_the_rest(worker: Document, shape: PodShape) -> None:
 
 
 def _place(spec: Document, wishes: Resources) -> None:
-    """Add the nodes that functions wish to those that the program's pod wishes."""
+    """Add the node selector and tolerations that functions ask for."""
     if wishes.node_selector:
         spec["nodeSelector"] = {**(spec.get("nodeSelector") or {}), **dict(wishes.node_selector)}
     there = spec.get("tolerations") or []
@@ -120,7 +120,7 @@ def _place(spec: Document, wishes: Resources) -> None:
 
 
 def _give_shm(spec: Document, worker: Document, size: int) -> None:
-    """Mount memory of ``size`` MiB at /dev/shm, in place of what the program has there."""
+    """Mount memory of ``size`` MiB at /dev/shm, in place of the program's mount there."""
     mounts = [m for m in worker.get("volumeMounts") or () if m["mountPath"].rstrip("/") != _SHM]
     used = {m["name"] for m in (*mounts, *(worker.get("volumeDevices") or ()))}
     volumes = [v for v in spec.get("volumes") or () if v["name"] in used]
@@ -129,7 +129,7 @@ def _give_shm(spec: Document, worker: Document, size: int) -> None:
     worker["volumeMounts"] = [*mounts, {"name": _SHM_VOLUME, "mountPath": _SHM}]
 
 
-# ---- like the program's own pod -------------------------------------------------------------
+# ---- copy of the program's pod --------------------------------------------------------------
 
 _OF_THE_POD = (
     "affinity",
@@ -147,8 +147,8 @@ _OF_THE_POD = (
     "tolerations",
     "topologySpreadConstraints",
 )
-"""Fields of the program's pod that a worker's pod gets.  Not its name and labels, by which others
-select it; not its other containers; not its requests, since the program is no worker."""
+"""Fields of the program's pod that a worker's pod gets.  Services select the program's pod by its
+labels, and its requests are those of the program, so workers get neither."""
 
 _OF_THE_CONTAINER = (
     "env",
@@ -162,7 +162,7 @@ _OF_THE_CONTAINER = (
 )
 
 _ACCOUNT = "/var/run/secrets/kubernetes.io/serviceaccount"
-"""Folder of a pod's token, which workers do not get: they need nothing of the API."""
+"""Folder of a pod's token, which workers do not get: they make no calls to the API."""
 
 
 def _like(pod: Mapping[str, Any], container: str) -> Document:
@@ -184,9 +184,9 @@ def _like(pod: Mapping[str, Any], container: str) -> Document:
 
 
 def secrets_left_out(pod: Mapping[str, Any], container: str) -> list[str]:
-    """Names of the container's variables that workers do not get, because they look like secrets.
+    """Return names of the container's variables that look like secrets; workers do not get them.
 
-    Everybody who may read FiberPools would read them there.
+    A FiberPool would show their values to all its readers.
     """
     found = next(c for c in pod["spec"]["containers"] if c["name"] == container)
     return [v["name"] for v in found.get("env") or () if _is_secret(v)]
@@ -199,7 +199,7 @@ _SECRET = re.compile(
 
 
 def _is_secret(variable: Mapping[str, Any]) -> bool:
-    """Tell whether the manifest has the value itself, under the name of a secret."""
+    """Return whether the variable has a value in the manifest, and the name of a secret."""
     return bool(variable.get("value")) and _SECRET.search(variable["name"]) is not None
 
 
@@ -218,8 +218,9 @@ def _is_the_pods(mount: Mapping[str, Any]) -> bool:
 
 
 def _is_default(toleration: Mapping[str, Any]) -> bool:
-    """Tell whether the API server added the toleration.  The operator gives workers shorter ones,
-    unless the template has such a toleration.
+    """Return whether the API server added the toleration.
+
+    The operator gives workers shorter ones, unless the template has such a toleration.
     """
     key = str(toleration.get("key"))
     return toleration.get("tolerationSeconds") == 300 and key.startswith("node.kubernetes.io/")
@@ -233,7 +234,7 @@ def _among_workers(constraint: Mapping[str, Any]) -> Document:
 
 
 def _rename(document: object, container: str) -> None:
-    """Let what refers to the program's container refer to the worker's."""
+    """Change references to the program's container into references to the worker's."""
     if isinstance(document, list):
         for item in document:
             _rename(item, container)
@@ -251,8 +252,8 @@ _TERMINATION_LOG = re.compile(r"/pods/[^/ ]+/containers/([^/ ]+)/\S+ /dev/termin
 def own_container(pod: Mapping[str, Any], mountinfo: str) -> str:
     """Return the container of its pod that this program runs in, by ``/proc/self/mountinfo``.
 
-    The kubelet keeps the file that it mounts in each container in a folder of that name.  Where
-    that cannot be seen it is the one that kubectl takes if told of none.
+    The kubelet mounts a file into each container, from a folder with the container's name.  If
+    that is not visible, this is kubectl's default container.
     """
     containers = [container["name"] for container in pod["spec"]["containers"]]
     seen = _TERMINATION_LOG.search(mountinfo)
@@ -268,7 +269,7 @@ def own_container(pod: Mapping[str, Any], mountinfo: str) -> str:
 
 
 def fiber_pool_body(name: str, template: Mapping[str, Any], config: Config) -> Document:
-    """A FiberPool for the program's own use, without what ties it to its master."""
+    """Return a FiberPool for this program alone, without the fields of its master."""
     return {
         "apiVersion": names.API_VERSION,
         "kind": names.KIND,
@@ -284,33 +285,34 @@ def fiber_pool_body(name: str, template: Mapping[str, Any], config: Config) -> D
 
 @dataclass(frozen=True, slots=True)
 class PodShape:
-    """All that decides what a pod is like.  Equal shapes are served by one FiberPool."""
+    """Everything that a pod's template depends on.  Equal shapes share one FiberPool."""
 
     image: str | None = None
-    """None: that of the program's own pod, or of this version's worker."""
+    """Image; None for that of the program's pod, or of this version's worker."""
     resources: Resources = field(default_factory=Resources)
     """Resources that one process needs."""
     template: str = field(default="{}", repr=False)
     """The configured pod template, as JSON with sorted keys."""
     processes_per_pod: int = 1
     cpu_request: float = 0
-    """CPUs to request for a process whose function wishes none."""
+    """CPUs to request for a process whose function asks for none."""
     memory_request: int = 0
-    """MiB, likewise."""
+    """MiB of memory to request for a process whose function asks for none."""
     shm: int | None = None
-    """MiB of memory at /dev/shm; None: what a container has by itself."""
+    """MiB of memory at /dev/shm; None for the default of containers."""
 
     @classmethod
     def of(cls, config: Config) -> PodShape:
-        """The shape of a function without wishes.  Reads the template's file: a ConfigError names
-        it where that cannot be.
+        """Return the shape for functions that ask for nothing.
+
+        ConfigError: the file of the template cannot be read.
         """
         template = read_template(config.template)
         try:
             text = json.dumps(template, sort_keys=True)
         except (TypeError, ValueError) as error:
             raise ConfigError(
-                f"bad value for 'template': {error}. A template holds what JSON can say: write a "
+                f"bad value for 'template': {error}. A template has only values of JSON: write "
                 "text that looks like a date in quotes."
             ) from error
         selector, tolerations = config.node_selector, config.tolerations
@@ -325,7 +327,7 @@ class PodShape:
         )
 
     def with_resources(self, resources: Resources) -> PodShape:
-        """The same for a function with these wishes, which win over those that are there."""
+        """Return the shape for a function with these resources, which override those here."""
         return replace(self, resources=merged(self.resources, resources))
 
 
@@ -333,7 +335,7 @@ class PodShape:
 
 
 def read_template(configured: str | Mapping[str, Any] | None) -> dict[str, Any]:
-    """A pod template with nothing but ``metadata`` and ``spec``; ConfigError if it is none."""
+    """Return a pod template with only ``metadata`` and ``spec``; ConfigError if it is none."""
     if configured is None:
         return {}
     if isinstance(configured, str):
@@ -370,15 +372,15 @@ def _parse_yaml(text: str) -> object:
 
 def _checked(document: object, what: str) -> dict[str, Any]:
     if not isinstance(document, Mapping):
-        raise ConfigError(f"{what} is no object with metadata and spec, as in a Deployment")
-    # A whole Pod is a template of itself.
+        raise ConfigError(f"{what} is not an object with metadata and spec, as in a Deployment")
+    # A whole Pod may be given too.
     template = {key: part for key, part in document.items() if key not in ("apiVersion", "kind")}
     for key, part in template.items():
         if key not in ("metadata", "spec"):
-            hint = ". What belongs to the pod goes under 'spec'" if "spec" not in template else ""
+            hint = ". Put fields of the pod under 'spec'" if "spec" not in template else ""
             raise ConfigError(f"{what} has {key!r} beside metadata and spec{hint}")
         if not isinstance(part, Mapping):
-            raise ConfigError(f"{what} has a {key} that is no object")
+            raise ConfigError(f"{what} has a {key} that is not an object")
     for container in template.get("spec", {}).get("containers") or ():
         _check_container(container, what)
     return template
@@ -404,22 +406,20 @@ def _check_container(container: object, what: str) -> None:
 
 
 def program_name(path: str | None) -> str:
-    """Return a name for the program with this ``__main__.__file__``, to show with its pools.
+    """Return a name for the program with this ``__main__.__file__``, for the names of its pools.
 
-    None is one that has no file, such as an interactive session.
+    None: the program has no file, as an interactive session.
     """
     if not path:
         return _PROGRAM
     folder, file = os.path.split(os.path.abspath(path))
     stem = os.path.splitext(file)[0]
-    # `main.py` says nothing; the folder that it is in does.
+    # ``main.py`` is too common: the name of its folder says more.
     return _label(stem if stem not in ("main", "__main__") else os.path.basename(folder))
 
 
 def pool_name(program: str, shape: PodShape, suffix: str) -> str:
-    """The name of a FiberPool: the program's, what it wishes of a pod, and what is drawn by the
-    caller so that no name is used twice.
-    """
+    """Return the name of a FiberPool: program, resources of a pod, and a unique ``suffix``."""
     end = "".join(f"-{word}" for word in (*_words(shape.resources), suffix))
     return f"{_label(program)[: names.MAX_POOL_NAME - len(end)].rstrip('-')}{end}"
 
@@ -428,7 +428,7 @@ _PROGRAM = "python"
 
 
 def _label(name: str) -> str:
-    """``name`` in the letters that a pool's name may have, from the first letter on."""
+    """Return ``name`` with only the characters of a pool's name, from the first letter on."""
     label = re.sub("[^a-z0-9]+", "-", name.lower()).strip("-")
     return re.sub("^[^a-z]+", "", label) or _PROGRAM
 
@@ -443,7 +443,7 @@ def _words(resources: Resources) -> list[str]:
 
 
 def quantity(cpus: float) -> str:
-    """CPUs as Kubernetes writes them, to the thousandth: ``2``, ``500m``."""
+    """Return CPUs as Kubernetes writes them, to the thousandth: ``2``, ``500m``."""
     thousandths = max(1, round(cpus * 1000))
     return f"{thousandths}m" if thousandths % 1000 else str(thousandths // 1000)
 
@@ -462,7 +462,7 @@ _MERGED = frozenset({"containers", "initContainers"})
 
 
 def merge_template(template: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """``template`` with what ``over`` says in place of what it says; neither is changed."""
+    """Return ``template`` with the values of ``over`` merged into it; neither is changed."""
     merged = copy.deepcopy(dict(template))
     for key, value in over.items():
         if value is None:
@@ -478,7 +478,7 @@ def _merge(key: str, ours: Any, theirs: Any) -> Any:
     named_by = _KEYS.get(key)
     if named_by and isinstance(theirs, list) and all(_has(item, named_by) for item in theirs):
         return _merge_named(ours or [], theirs, named_by, in_turn=key in _MERGED)
-    # Also what makes no sense: the API server's complaint is better than one of ours.
+    # Also a value of a wrong type: the API server reports it best.
     return copy.deepcopy(theirs)
 
 
