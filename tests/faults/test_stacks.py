@@ -45,7 +45,7 @@ def test_an_environment_that_nothing_stops_says_where_it_was(
     monkeypatch.setattr(worker_process, "GRACE", 0.3)
     env = VectorEnv([HangingEnv], num_workers=1, timeout=0.5)
     env.reset()
-    with pytest.raises(fiber.TimeoutError, match="so worker .* was killed") as caught:
+    with pytest.raises(fiber.TimeoutError, match=r"so worker .* was killed") as caught:
         env.step([0])
     env.close(terminate=True)
     assert " in hang_in_native_code" in str(caught.value)
