@@ -1,4 +1,4 @@
-"""What `make test` is about to run, how long that takes, and what it leaves out here and why.
+"""Plan of `make test`: what it will run, how long that takes, and what it skips here and why.
 
 python -m announcement [VERSION …]     the other versions of Python that were found
 """
@@ -14,12 +14,12 @@ from cluster import ability, build
 from cluster.ability import Choice
 
 SUPPORTED = ("3.11", "3.12", "3.13")
-# Minutes on two processors with nothing else to do; to be corrected where they are far off.
+# Minutes on two idle processors. Correct them where they are far off.
 _MODULES, _OTHER_PYTHON, _PROGRAMS, _CONFORMANCE, _CLUSTER = 6, 2, 7, 6, 20
 
 
 def announcement(others: Sequence[str], environment: Mapping[str, str]) -> str:
-    """For a person, before a long wait."""
+    """Return the plan for a person who is about to wait."""
     runs = list(_parts(others, environment))
     lines = [f"make test: about {sum(minutes for _, minutes in runs)} minutes on two processors"]
     lines += [f"  {minutes:2} min  {what}" for what, minutes in runs]

@@ -15,7 +15,8 @@ from typing import NamedTuple
 
 Identity = tuple[int, int]
 """Number of a process, and the inode of its folder in /proc: a later process with the same number
-has another inode."""
+has another inode.
+"""
 
 
 class Found(NamedTuple):
@@ -31,7 +32,7 @@ class Found(NamedTuple):
 
 
 def read(pid: int) -> Found | None:
-    """One process, or None when it is gone."""
+    """Read one process; None if it is gone."""
     try:
         with open(f"/proc/{pid}/stat", encoding="utf-8", errors="replace") as file:
             stat = file.read()
@@ -87,7 +88,7 @@ def kill(found: Iterable[Found]) -> None:
 
 
 def wait_until(condition: Callable[[], bool], seconds: float) -> bool:
-    """Whether `condition` came true within `seconds`, asked often enough not to be noticed."""
+    """Return whether `condition` came true within `seconds`. Ask rarely enough to cost nothing."""
     deadline = time.monotonic() + seconds
     pause = 0.001
     while not condition():

@@ -99,7 +99,7 @@ def _nothing_left_at_the_end(
     tempfile.tempdir = None
     shutil.rmtree(folder)
     ended_early = request.session.shouldfail or request.session.exitstatus == _INTERRUPTED
-    if left and not ended_early:  # then a failure here would hide what the tests told
+    if left and not ended_early:  # then a failure here would hide the test's own failure
         pytest.fail("left at the end of the session: " + "; ".join(left), pytrace=False)
 
 

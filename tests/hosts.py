@@ -28,7 +28,7 @@ class Wire:
         self.frames = 0
 
     def send(self, frame: HubMessage) -> None:
-        """On the loop's thread, as links are used."""
+        """Send on the loop's thread, where links are used."""
         self.frames += 1
         encoded = frame.encode()
         if self.held is None:
@@ -41,7 +41,7 @@ class Wire:
         self.held = deque()
 
     def let_go(self) -> None:
-        """Deliver what was held."""
+        """Deliver the held frames."""
         held, self.held = self.held or deque(), None
         for encoded in held:
             self._loop.call_soon(self._deliver, encoded)
@@ -80,7 +80,7 @@ class Hosts:
 
     @contextlib.contextmanager
     def at(self, name: str) -> Iterator[Hub]:
-        """In the block, this process is on that host, and the hub's own."""
+        """Make this process a part of that host in the block, and the hub's own."""
         before = client._local_hub, client._address
         client._local_hub, client._address = self[name], None
         try:
@@ -90,7 +90,7 @@ class Hosts:
 
     @contextlib.contextmanager
     def child_at(self, name: str) -> Iterator[Hub]:
-        """In the block, this process is a child there, which reaches the hub by its socket."""
+        """Make this process a child there in the block; it reaches the hub by its socket."""
         before = client._local_hub, client._address
         client._local_hub, client._address = None, self[name].address
         try:
@@ -107,7 +107,7 @@ class Hosts:
 
 
 def objects_kept(hub: Hub) -> int:
-    """How many objects it keeps, once it has done what it was asked for until now."""
+    """Return how many objects it keeps, once it has done all earlier requests."""
     done = threading.Event()
     hub._loop.call_soon(done.set)
     assert done.wait(PATIENCE)
@@ -115,7 +115,7 @@ def objects_kept(hub: Hub) -> int:
 
 
 class Far:
-    """Brings what lives on host a to this process on host b."""
+    """Function that moves an object of host a to this process on host b."""
 
     def __init__(self, hosts: Hosts) -> None:
         self._hosts = hosts

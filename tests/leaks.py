@@ -1,4 +1,4 @@
-"""What a test may not leave behind: processes, threads, open files, temporary files.
+"""Leaks that fail a test: processes, threads, open files, temporary files.
 
 The process-wide runtime of Fiber (thread, zygotes, agents) lives as long as the session. Its own
 processes are known by their command line, and open files are compared only between two moments at
@@ -32,14 +32,14 @@ _NNG_OPENS = Counter(["anon_inode:[eventpoll]", "anon_inode:[eventfd]"])
 # Memory for large messages is kept for the next ones; each block holds two descriptors.
 _MESSAGE_MEMORY = "/memfd:fiber-message (deleted)"
 _MESSAGE_MEMORY_LIMIT = 2 * RETAINED_BLOCKS
-# So is memory for small shared objects: a segment for each size of them, and a full one of which
-# places are free again; each may hold two descriptors.
+# So is memory for small shared objects: one segment for each size, and one full segment with free
+# places; each may hold two descriptors.
 HEAP = "/memfd:fiber-heap (deleted)"
 HEAP_LIMIT = 4 * len(SIZES)
 
 
 class Lasting(NamedTuple):
-    """What outlives a test by design and holds files open."""
+    """Objects that outlive a test by design and hold files open."""
 
     runtime: object | None
     address: object | None
@@ -48,7 +48,7 @@ class Lasting(NamedTuple):
 
 
 class Snapshot(NamedTuple):
-    """What there is at one moment."""
+    """State at one moment."""
 
     lasting: Lasting
     processes: frozenset[int]
@@ -79,20 +79,20 @@ class Watch:
         )
 
     def left_since(self, before: Snapshot, *, excuse_runtime: bool = True) -> list[str]:
-        """What is there now and was not before, in words, once all that is ending has ended."""
+        """Return the leftovers in words, once all that is ending has ended."""
         deadline = time.monotonic() + SETTLE
         pause = 0.001
         while left := self._compare(before, excuse_runtime):
             if time.monotonic() > deadline:
                 break
             gc.collect()
-            multiprocessing.active_children()  # joins what has ended, which holds a descriptor
+            multiprocessing.active_children()  # joins the ended threads, which hold descriptors
             time.sleep(pause)
             pause = min(pause * 2, 0.1)
         return left
 
     def kill_processes_since(self, before: Snapshot) -> None:
-        """End what a failed test left, so that the next one is judged by its own deeds."""
+        """End the leftovers of a failed test, so that they do not fail the next one."""
         started = self._started()
         spared = before.processes | before.lasting.processes | _excused(started)
         census.kill(found for found in started if found.pid not in spared)

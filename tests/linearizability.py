@@ -1,4 +1,4 @@
-"""Whether what several processes saw of an object could have happened one operation at a time.
+"""Search for an order of operations that explains what several processes saw of an object.
 
 The search of Wing and Gong (Testing and verifying concurrent objects, 1993): the next operation in
 order is one of those that began before any other that is left had ended, and the object's model
@@ -13,13 +13,13 @@ from typing import Any, NamedTuple
 
 
 class Operation(NamedTuple):
-    """What one process did, and saw."""
+    """One operation of a process, with its result."""
 
     name: str
     argument: Hashable
     result: Any
     start: int
-    """Of the clock that all processes of a machine share, in ns."""
+    """Time of the clock that all processes of a machine share, in ns."""
     end: int
 
 
@@ -35,7 +35,7 @@ def call(name: str, action: Callable[..., Any], *arguments: Any) -> Operation:
 
 
 def is_linearizable(history: Iterable[Operation], model: Model, state: Hashable) -> bool:
-    """Whether some order that respects the clock explains all."""
+    """Return whether some order that respects the clock explains all."""
     operations = sorted(history, key=lambda operation: operation.start)
     left = frozenset(range(len(operations)))
     seen = {(left, state)}
@@ -57,7 +57,7 @@ def is_linearizable(history: Iterable[Operation], model: Model, state: Hashable)
 
 
 def semaphore(maximum: int) -> Model:
-    """Of a semaphore or lock; its state is the number of tokens that are there."""
+    """Model of a semaphore or lock; its state is the number of free tokens."""
 
     def model(tokens: int, operation: Operation) -> int | None:
         if operation.name == "release":
@@ -70,7 +70,7 @@ def semaphore(maximum: int) -> Model:
 
 
 def queue(items: tuple[Hashable, ...], operation: Operation) -> tuple[Hashable, ...] | None:
-    """Of a queue; its state is what is in it."""
+    """Model of a queue; its state is its items."""
     if operation.name == "put":
         return (*items, operation.argument)
     if items and items[0] == (operation.result,):

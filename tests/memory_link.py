@@ -111,7 +111,7 @@ class Cable:
         self._connect()
 
     def cut(self) -> None:
-        """Let nothing through any more, and tell nobody."""
+        """Drop all packets, without notice to either side."""
         self.is_cut = True
 
     def mend(self) -> None:
@@ -119,7 +119,7 @@ class Cable:
         self.is_cut = False
 
     def break_off(self) -> None:
-        """Break the connection; what is under way is lost, and the agent dials again."""
+        """Break the connection; packets in flight are lost, and the agent dials again."""
         broken, self._wires = self._wires, ()
         for wire in broken:
             wire.disconnect()
@@ -157,12 +157,12 @@ class MemoryWire:
         lost = cable.is_cut or cable.random.random() < cable.drop
         if lost or self.other is None:
             return
-        # Never before what was sent earlier.
+        # Never before an earlier message.
         self._free_at = max(self._free_at, cable.loop.now() + cable.random.uniform(*cable.delay))
         cable.loop.call_later(self._free_at - cable.loop.now(), self._arrive, self.other, datagram)
 
     def break_off(self) -> None:
-        """Break the connection, of which both sides hear."""
+        """Break the connection; both sides are notified."""
         if self.other is not None:
             self._cable.break_off()
 

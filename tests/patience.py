@@ -1,4 +1,4 @@
-"""How long a test waits for a condition before it calls the program hung."""
+"""Deadline of a test that waits for a condition: after it the program counts as hung."""
 
 PATIENCE = 60.0
-"""Seconds.  A deadline tells a hang from slow work, on a busy machine too, and nothing else."""
+"""Seconds. A deadline only tells a hang from slow work, also on a busy machine."""

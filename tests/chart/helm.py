@@ -37,19 +37,22 @@ def find_helm() -> str | None:
 
 @dataclass(frozen=True)
 class Helm:
-    """One helm program, whose files go to a folder of its own instead of the user's home."""
+    """Helm program whose files go to a temporary folder instead of the user's home."""
 
     program: str
     home: Path
     _rendered: dict[str, str] = field(default_factory=dict)
-    """By what was asked: a chart renders the same each time, and Helm takes its time."""
+    """Cache of rendered charts by their arguments:
+
+    a chart renders the same each time, and Helm is slow.
+    """
 
     def render(self, values: Values = DEFAULTS, *, release: str = RELEASE) -> list[Manifest]:
         """Every manifest for these values, hooks included, in Helm's order."""
         return self._template(CHART, values, release)
 
     def notes(self, values: Values = DEFAULTS) -> str:
-        """What a person reads after `helm install`."""
+        """Return the text that a person reads after `helm install`."""
         with tempfile.TemporaryDirectory(dir=self.home) as folder:
             # Helm shows the notes only where it installs, so a copy of the chart shows its own.
             chart = Path(shutil.copytree(CHART, Path(folder) / CHART.name))

@@ -20,7 +20,7 @@ END = "<!-- End of the table. -->\n"
 
 @dataclass(frozen=True)
 class Value:
-    """One value that can be set."""
+    """Row for one value that can be set."""
 
     path: str
     default: Any

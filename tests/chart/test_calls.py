@@ -1,4 +1,4 @@
-"""The operator's rights are the calls that it makes: none is missing, and none is to spare.
+"""Check that the operator's rights are exactly the calls that it makes.
 
 The operator lives through all that makes it call the API server, in virtual time and with a fake
 one, which takes note.
@@ -34,7 +34,7 @@ MASTER = {
 
 @pytest.fixture(scope="module")
 def calls() -> list[Call]:
-    """Every call of a life in which everything happens."""
+    """Return the calls of an operator that meets every event."""
     made: list[Call] = []
 
     async def test() -> None:
@@ -59,7 +59,7 @@ def calls() -> list[Call]:
 
 
 async def watch(world: World, stop: asyncio.Event) -> None:
-    """What the operator's own thread does."""
+    """Run the watches of the operator's own thread."""
 
     async def configure() -> Configuration:
         return configuration(world.api)
@@ -85,7 +85,7 @@ async def loses_workers(world: World) -> None:
 
 
 async def keeps_a_budget(world: World) -> None:
-    """Its owner asks for one, somebody meddles with it, and its owner thinks better of it."""
+    """Ask for a budget, change it from outside, and remove the request."""
     world.edit(minAvailable=1)
     await world.until(lambda: bool(counted(world, "create", "poddisruptionbudgets")))
     meddled = {"spec": {"minAvailable": 5}}
@@ -96,7 +96,7 @@ async def keeps_a_budget(world: World) -> None:
 
 
 async def gets_stuck(world: World) -> None:
-    """A node cannot start a worker, and only an event says why; then it is not wanted any more."""
+    """Request a worker that its node cannot start, as only an event says; then scale down."""
     world.kubelet.auto = False
     world.edit(replicas=3)
     await world.until(lambda: len(world.names()) == 3)
@@ -109,7 +109,7 @@ async def gets_stuck(world: World) -> None:
 
 
 async def meets_masters(world: World) -> None:
-    """Of one address family and the other, while somebody meddles with the Service."""
+    """Attach masters of both address families, while the Service is changed from outside."""
     world.store.create("leases", NAMESPACE, {"metadata": {"name": MASTER["leaseName"]}})
     world.edit(master=MASTER, onLost="Delete")
     world.store.merge("services", NAMESPACE, "es-fiber", {"spec": {"selector": {"app": "x"}}})
@@ -119,7 +119,7 @@ async def meets_masters(world: World) -> None:
 
 
 async def is_orphaned(world: World) -> None:
-    """Nobody renews the Lease of its master."""
+    """Let the Lease of a master expire."""
     await world.until(lambda: not world.store.list("fiberpools"), within=600)
 
 
@@ -128,7 +128,7 @@ def counted(world: World, verb: str, plural: str) -> int:
 
 
 def rights(calls: Iterable[Call], where: Callable[[Call], bool]) -> set[Right]:
-    """What RBAC was asked for."""
+    """Return the permissions that RBAC was asked for."""
     return {
         (
             KINDS[call.plural][0].rpartition("/")[0],

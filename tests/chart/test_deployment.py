@@ -15,7 +15,7 @@ from fiber_api.names import check_pool_name
 from fiber_operator.settings import OperatorSettings
 
 DNS_LABEL = "[a-z]([-a-z0-9]{0,61}[a-z0-9])?"
-"""What a Service may be called."""
+"""Pattern of a Service's name."""
 SOON_GONE: list[dict[str, Any]] = [
     {
         "key": f"node.kubernetes.io/{taint}",

@@ -1,4 +1,4 @@
-"""What a person reads after the installation can be done as it stands there."""
+"""Run the notes of the installation: each command in them works as it stands."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""One switch drives what the operator may do, what it looks at, and where it is tested."""
+"""Scope of the operator:
+
+one switch sets what it may do, what it watches, and where it is tested.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +52,7 @@ def subject(account: str) -> dict[str, str]:
 
 
 def role_of(manifests: list[Manifest], namespace: str) -> Manifest:
-    """What the operator's binding in this namespace ("" for all) refers to."""
+    """Return what the operator's binding in this namespace ("" for all) refers to."""
     kind = "Role" if namespace else "ClusterRole"
     here = [
         manifest

@@ -1,4 +1,4 @@
-"""What `helm test` runs, against pools in memory: what it says, and that it cleans up."""
+"""Run of `helm test` against pools in memory: its output, and that it cleans up."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ PULLING = {
 
 
 class Pools(Cluster):
-    """One FiberPool at most; each look at it shows the next status."""
+    """Stand-in API with at most one FiberPool; each read shows the next status."""
 
     def __init__(self, *statuses: dict[str, Any]) -> None:
         self.statuses = list(statuses)
@@ -83,7 +83,7 @@ class Pools(Cluster):
 
 
 def run(pools: Pools, patience: float = 15, tolerance: float = 15) -> list[str]:
-    """What the test says."""
+    """Return the output of the test."""
     said: list[str] = []
     test = smoke.Smoke(
         pools, MANIFEST, said.append, patience=patience, tolerance=tolerance, pause=0

@@ -1,4 +1,4 @@
-"""Which cluster this machine can run, asked before anything is built or installed."""
+"""Choice of the cluster that this machine can run, made before anything is built or installed."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _CAPABILITIES = {"CAP_NET_ADMIN": 12, "CAP_SYS_ADMIN": 21}
 
 
 class Choice(Enum):
-    """Where the end-to-end tests run; the value is how a sentence names it."""
+    """Kind of cluster for the end-to-end tests; the value is its name in a sentence."""
 
     GIVEN = "the cluster of KUBECONFIG"
     KIND = "a cluster of kind"
@@ -27,7 +27,7 @@ class Choice(Enum):
 
 
 def choose(environment: Mapping[str, str]) -> tuple[Choice, list[str]]:
-    """Where they run, and why not on what would come before that."""
+    """Return the kind of cluster, and why the kinds before it cannot run."""
     if environment.get("KUBECONFIG"):
         return Choice.GIVEN, []
     reasons = ["KUBECONFIG is not set"]
@@ -52,7 +52,7 @@ def kind_lacks() -> str | None:
 
 
 def obstacles() -> list[str]:
-    """What keeps the cluster from running here, in words; nothing where it can run."""
+    """Return the reasons why the cluster cannot run here; empty if it can."""
     return list(_obstacles())
 
 

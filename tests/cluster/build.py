@@ -20,11 +20,11 @@ from cluster.shell import ClusterError, locked, output, say
 # A third of the time: no information for debuggers and, of Kubernetes' own packages, no inlining.
 _COMPILER_FLAGS = ("-gcflags=all=-dwarf=false", "-gcflags=k8s.io/...=-dwarf=false -l")
 _CPU_MINUTES = 7
-"""What Kubernetes and Helm take of a processor where Go has compiled nothing yet."""
+"""Processor time that Kubernetes and Helm take to build where Go has compiled nothing yet."""
 
 
 def build(names: Iterable[str] = places.SOURCES) -> None:
-    """Build what is missing of these; returns at once when nothing is."""
+    """Build the missing ones of these; return at once if none is missing."""
     wanted = [name for name in names if missing(name)]
     if not wanted:
         return
@@ -47,7 +47,7 @@ def _build(name: str) -> None:
     go, source = find_go(), places.SOURCES[name]
     say(f"building {name} {places.version(name)} with {go}, once{_advice(name)}")
     began = time.monotonic()
-    # Programs appear when they are whole: a build that is killed leaves nothing that looks built.
+    # Programs appear when they are whole: a build that is killed leaves no file that looks built.
     unfinished = places.cache() / "unfinished"
     shutil.rmtree(unfinished, ignore_errors=True)
     unfinished.mkdir(parents=True)
@@ -70,12 +70,12 @@ def _build(name: str) -> None:
 
 
 def minutes() -> int:
-    """About how long it takes to build it all where nothing else runs."""
+    """Return about how many minutes a whole build takes on an idle machine."""
     return math.ceil(_CPU_MINUTES / len(os.sched_getaffinity(0)))
 
 
 def _advice(name: str) -> str:
-    """What a person who waits for minutes wants to know."""
+    """Return the advice for a person who waits for minutes."""
     if name != "kubernetes":
         return ""
     return (
@@ -116,7 +116,9 @@ def _linker_flags(name: str) -> str:
 
 
 def module_sources(name: str) -> Path:
-    """Where Go keeps the sources of a module, and all files that came with them."""
+    """Return the folder in which Go keeps the sources of a module, with all files that came with
+    them.
+    """
     source = places.SOURCES[name]
     command = (find_go(), "mod", "download", "-json", source.module)
     found = json.loads(output(*command, cwd=places.HERE / source.folder))

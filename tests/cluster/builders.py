@@ -1,4 +1,4 @@
-"""What builds images: docker where its daemon runs, else buildah, which needs none."""
+"""Image builders: docker if its daemon runs, else buildah, which needs none."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _PIP_SETTINGS = ("extra-index-url", "index-url", "proxy", "retries", "timeout", 
 
 
 class Builder(ABC):
-    """Makes an image of a Dockerfile of ours, as an archive."""
+    """Builder that makes an archive from a Dockerfile of the project."""
 
     def base(self, wanted: str) -> str:
         """The base image to use where this one is wanted."""
@@ -57,7 +57,7 @@ class Builder(ABC):
 
     @abstractmethod
     def remove(self, reference: str) -> None:
-        """Remove an image that nobody needs any more, if it is there."""
+        """Remove an image that is no longer needed, if it exists."""
 
 
 class Docker(Builder):
@@ -95,7 +95,7 @@ class Buildah(Builder):
 
     def _build(self, reference: str, context: Path, options: list[str]) -> None:
         command = ("bud", "--quiet", "--layers", "--isolation", "chroot", "--network", "host")
-        # Where buildah keeps a step's cache, for longer than who asks for the image keeps files.
+        # buildah keeps a step's cache here, longer than the caller keeps files.
         environment = {**os.environ, "TMPDIR": "/var/tmp"}
         output(*BUILDAH, *command, "--tag", reference, *options, cwd=context, env=environment)
 

@@ -33,7 +33,7 @@ def _pass_on_controllers(folder: Path) -> None:
 
 
 def holds_a_pod(cgroup_of_process: str) -> bool:
-    """Whether /proc/PID/cgroup is that of a process in a pod of ours."""
+    """Return whether /proc/PID/cgroup is that of a process in a pod of this cluster."""
     return _IN_A_POD.search(cgroup_of_process) is not None
 
 

@@ -9,7 +9,7 @@ from cluster.shell import answer, output, succeeds
 
 
 class Containerd:
-    """One node's containerd. Images must be loaded into each: there is no registry."""
+    """Containerd of one node. Images must be loaded into each: there is no registry."""
 
     def __init__(self, index: int) -> None:
         self.index = index
@@ -19,7 +19,7 @@ class Containerd:
         return self.socket.exists() and succeeds(*self._ctr("version"), timeout=5)
 
     def answer(self) -> str:
-        """What it says when it is asked, or what is said in its place."""
+        """Return its answer, or the error in its place."""
         return answer(*self._ctr("version"), timeout=5)
 
     def images(self) -> list[str]:

@@ -23,7 +23,7 @@ def start(pki: Pki) -> None:
     etcd.start(
         "etcd",
         f"--data-dir={places.STATE}/etcd",
-        "--unsafe-no-fsync",  # what is in it need not survive the machine
+        "--unsafe-no-fsync",  # The folder's contents need not survive the machine.
         f"--listen-client-urls={_ETCD}",
         f"--advertise-client-urls={_ETCD}",
         f"--listen-peer-urls={_ETCD_PEERS}",
@@ -46,8 +46,8 @@ def start_apiserver(pki: Pki) -> None:
         "--secure-port=6443",
         f"--service-cluster-ip-range={places.SERVICE_RANGE}",
         "--authorization-mode=Node,RBAC",
-        # The second one is stricter than most clusters: an owner may only be set by who may
-        # delete it, so that a missing right of the operator is found.
+        # The second one is stricter than most clusters: a client may set an owner only if it may
+        # delete that owner. So a missing right of the operator is found.
         "--enable-admission-plugins=NodeRestriction,OwnerReferencesPermissionEnforcement",
         "--allow-privileged=true",
         "--kubelet-preferred-address-types=InternalIP",

@@ -30,7 +30,7 @@ _KEEPER = (
 
 
 class Daemon:
-    """One process by its name, whether it runs or not."""
+    """One process by its name, running or not."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -40,7 +40,7 @@ class Daemon:
         self._status_file = places.STATE / "daemons" / f"{name}.process.status"
 
     def start(self, *command: str | Path, namespace: str = "") -> None:
-        """Start it with this command, in a network namespace; nothing happens when it runs."""
+        """Start it with this command in a network namespace; do nothing if it runs."""
         if self.runs():
             return
         words = [str(word) for word in command]
@@ -52,19 +52,19 @@ class Daemon:
         self.start_again()
 
     def start_again(self) -> None:
-        """Start it with the command that it had; nothing happens when it runs."""
+        """Start it with the command that it had; do nothing if it runs."""
         if not self.runs():
             self._spawn(self.command)
 
     @property
     def command(self) -> list[str]:
-        """What it was started with."""
+        """Command of its last start."""
         words: list[str] = json.loads(self._command_file.read_text())
         return words
 
     def _spawn(self, words: list[str]) -> None:
-        # The child of a child: nobody here has to wait for it, and it is not taken for a process
-        # that a test has left. It knows nothing of the environment of who started it.
+        # The process is the child of a child, so this process need not wait for it, and the tests
+        # do not take it for a leak. It inherits no environment variables from the caller.
         environment = {"PATH": f"{places.programs()}:{_SYSTEM_PATH}", "HOME": "/root"}
         self._forget()
         with self.log.open("ab") as log:
@@ -111,14 +111,17 @@ class Daemon:
         self._status_file.unlink(missing_ok=True)
 
     def status(self) -> int | None:
-        """How it ended, as a shell counts: 128 and more is a signal. None where nobody saw it."""
+        """Return its exit status as a shell counts:
+
+        128 and more is a signal. None if it was not recorded.
+        """
         try:
             return int(self._status_file.read_text())
         except (OSError, ValueError):
             return None
 
     def killed_meanwhile(self) -> int:
-        """How many processes the kernel has killed for want of memory since this one began."""
+        """Return how many processes the kernel killed for lack of memory since this one began."""
         return memory.kills() - memory.kills(self._record)
 
     def last_words(self) -> str:
@@ -138,13 +141,13 @@ def all_daemons() -> list[Daemon]:
 
 
 class _Process(NamedTuple):
-    """What /proc/PID/stat says of a process."""
+    """State of a process from /proc/PID/stat."""
 
     pid: int
     lives: bool
     group: int
     began: int
-    """In ticks since the machine began."""
+    """Start time in ticks since the machine began."""
 
     @classmethod
     def read(cls, file: Path) -> _Process | None:
@@ -152,7 +155,7 @@ class _Process(NamedTuple):
             number, _, rest = file.read_text().partition("\n")[0].partition(" (")
             state, _, group, *others = rest.rpartition(") ")[2].split()
             return cls(int(number), state not in "ZX", int(group), int(others[16]))
-        except (OSError, ValueError, IndexError):  # it has ended, or nothing whole was written
+        except (OSError, ValueError, IndexError):  # it has ended, or the file is incomplete
             return None
 
     @classmethod

@@ -19,7 +19,7 @@ _NEEDED = "the cluster takes a gigabyte of memory, with its images a few gigabyt
 
 
 def end_of(daemons: Iterable[Daemon]) -> str | None:
-    """What is to be said of the first of these that has ended; None while all run."""
+    """Return the diagnosis of the first of these that has ended; None while all run."""
     return next((_end(daemon) for daemon in daemons if not daemon.runs()), None)
 
 
@@ -29,7 +29,7 @@ def _end(daemon: Daemon) -> str:
 
 
 def silence_of(daemons: Iterable[Daemon], answer: str) -> str:
-    """What is to be said where these run and what is waited for does not come all the same.
+    """Return the diagnosis if these run and the awaited condition does not come.
 
     The answer is what was said last to who asked.
     """

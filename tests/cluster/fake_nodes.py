@@ -18,7 +18,7 @@ from cluster.shell import wait_for
 KEY, VALUE = "kwok.x-k8s.io/node", "fake"
 _SIZE = {"cpu": "64", "memory": "256Gi", "pods": "500"}
 _LEASE = NODE_LOST_AFTER  # renewed four times as often
-# What the pretended world does by itself, of the stages that KWOK brings along.
+# The actions of the simulated world, from the stages that KWOK ships.
 _STAGES = ("node/fast", "node/heartbeat-with-lease", "pod/fast")
 
 

@@ -16,7 +16,7 @@ APISERVER = "apiserver"
 
 
 def cut(node: str) -> None:
-    """Pull the plug of a node: it keeps running, and hears and reaches nobody."""
+    """Disconnect a node: it keeps running, and no packet reaches or leaves it."""
     network.set_cable(_index(node), up=False)
 
 
@@ -37,7 +37,7 @@ def cut_off(node: str) -> Iterator[None]:
 
 @contextmanager
 def closed(node: str) -> Iterator[Callable[[Allowed], None]]:
-    """No packet reaches the node's pods or leaves them meanwhile, but for what is then allowed.
+    """Drop all packets from and to the node's pods meanwhile, except those allowed.
 
     Connections that there are go on.
     """

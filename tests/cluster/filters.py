@@ -1,4 +1,4 @@
-"""Packet filters that do what a network plugin does with a NetworkPolicy: ours enforces none.
+"""Packet filters in place of a network plugin: they enforce NetworkPolicy.
 
 A node is closed as a whole: its pods reach what is allowed, and nothing reaches them. Packets
 between two pods of one node pass the filter, too: the kernel shows it what a bridge forwards.
@@ -25,7 +25,7 @@ class Allowed(NamedTuple):
 
 
 def close(index: int) -> None:
-    """Drop each packet from and to the pods of a node, but for connections that there are."""
+    """Drop each packet from and to the pods of a node, except those of existing connections."""
     reopen(index)
     answers = ("--match", "conntrack", "--ctstate", "ESTABLISHED,RELATED", "--jump", "RETURN")
     _iptables(index, "--new-chain", _CHAIN)
@@ -42,7 +42,7 @@ def allow(index: int, allowed: Allowed) -> None:
 
 
 def reopen(index: int) -> None:
-    """Let all packets pass again; nothing happens where a node is not closed."""
+    """Let all packets pass again; do nothing if the node is not closed."""
     for command in (("--delete", *_JUMP), ("--flush", _CHAIN), ("--delete-chain", _CHAIN)):
         _iptables(index, *command, check=False)
 

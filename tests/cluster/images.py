@@ -33,15 +33,15 @@ ALWAYS = (".dockerignore", "LICENSE", "README.md", "pyproject.toml")
 
 @dataclass(frozen=True)
 class Image:
-    """One of our images: what it is called and what it is made of, below the checkout."""
+    """One image of the project: its name and its inputs below the checkout."""
 
     name: str
     dockerfile: str
     sources: tuple[str, ...]
     arguments: Mapping[str, str] = field(default_factory=dict)
-    """Of the Dockerfile, beside those that every build is told."""
+    """Build arguments of the Dockerfile, beside those that every build has."""
     made_from: Image | None = None
-    """The one of ours that it is built on, if it is not Python's."""
+    """Image of the project that it is built on, if it is not Python's."""
 
     @property
     def archive(self) -> Path:
@@ -53,7 +53,9 @@ class Image:
         return FOLDER / f"{self.name}.json"
 
     def archived(self) -> str | None:
-        """The reference of what is in the archive; None when nothing whole is there."""
+        """Return the reference of the image in the archive; None if the archive is missing or
+        incomplete.
+        """
         try:
             record = json.loads(self.record.read_text(encoding="utf-8"))
         except (OSError, ValueError):
@@ -68,7 +70,9 @@ class Image:
             yield from (file for file in found if file.is_file() and not _is_cache(file))
 
     def copy_inputs(self, checkout: Path, target: Path) -> None:
-        """Copy them to an empty folder, with their times, by which builders know what is new."""
+        """Copy them to an empty folder, with their modification times, by which builders find
+        changes.
+        """
         for file in self.inputs(checkout):
             copy = target / file.relative_to(checkout)
             copy.parent.mkdir(parents=True, exist_ok=True)
@@ -98,10 +102,10 @@ OPERATOR = Image(
 _WORKER_SOURCES = ("crds/fiber_api", "sdk/fiber")
 WORKER = Image("fiber-worker", "sdk/Dockerfile", _WORKER_SOURCES)
 WORKER_RL = Image("fiber-worker-rl", "sdk/Dockerfile", _WORKER_SOURCES, {"EXTRAS": "kubernetes,rl"})
-"""What the examples import is in it."""
+"""Image that contains the packages that the examples import."""
 IMAGES = (OPERATOR, WORKER, WORKER_RL)
 SEARCH = Image("fiber-search", "examples/05-search/Dockerfile", (VERSION_FILE,), made_from=WORKER)
-"""What a user makes of the worker's: only the tests that need it build it."""
+"""Image that a user builds from the worker's: only the tests that need it build it."""
 
 
 def _is_cache(file: Path) -> bool:
@@ -124,8 +128,8 @@ def build_images() -> dict[str, str]:
 
 
 def bring_images() -> dict[str, str]:
-    """Build what is out of date and import it into every node of our cluster."""
-    with _locked():  # nobody may replace an archive between the two
+    """Build what is out of date and import it into every node of the project's cluster."""
+    with _locked():  # no other process may replace an archive between the two
         references = {image.name: _up_to_date(image) for image in IMAGES}
         for image in IMAGES:
             load(image.archive, references[image.name])
@@ -150,7 +154,7 @@ def build(image: Image) -> str:
 
 
 def brought(image: Image) -> str | None:
-    """The reference of what was built last, if all nodes of our cluster have it."""
+    """Return the reference of the last build, if all nodes of the project's cluster have it."""
     reference = image.archived()
     if reference is None:
         return None
@@ -177,7 +181,7 @@ def _up_to_date(image: Image) -> str:
 def _build(image: Image, reference: str, base: str, context: Path) -> None:
     builder, python = builder_and_base()
     if image.made_from is None:
-        base = python  # what the builder has under the name
+        base = python  # the builder's reference under the name
     say(f"building {reference} on {base}")
     began = time.monotonic()
     previous = image.archived()
@@ -206,7 +210,7 @@ def _version(checkout: Path) -> str:
 
 
 def load(archive: Path, reference: str | None = None) -> None:
-    """Import an archive into every node, but for those that have the reference already."""
+    """Import an archive into every node that lacks the reference."""
     nodes = [Containerd(index) for index in places.nodes()]
     wanting = [node for node in nodes if reference is None or not node.has(full_name(reference))]
     with ThreadPoolExecutor() as pool:
@@ -215,5 +219,5 @@ def load(archive: Path, reference: str | None = None) -> None:
 
 
 def full_name(reference: str) -> str:
-    """What containerd calls an image that a pod names without a registry."""
+    """Return containerd's name for an image that a pod names without a registry."""
     return f"docker.io/library/{reference}"

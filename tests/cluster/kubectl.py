@@ -9,12 +9,12 @@ from cluster.shell import answer, output
 
 
 def kubectl(*arguments: str, check: bool = True) -> str:
-    """What kubectl prints, asked of our cluster."""
+    """Return kubectl's output for the project's cluster."""
     return output(*_command(), *arguments, check=check)
 
 
 def answer_of(*arguments: str) -> str:
-    """What kubectl prints, or what it complains about."""
+    """Return kubectl's output, or its error."""
     return answer(*_command(), *arguments)
 
 
@@ -23,6 +23,6 @@ def _command() -> tuple[str | Path, ...]:
 
 
 def ready_nodes(selector: str) -> int:
-    """How many of the nodes with these labels are Ready; 0 when nobody answers."""
+    """Return how many nodes with these labels are Ready; 0 if no API server answers."""
     listed = kubectl("get", "nodes", "--no-headers", "--selector", selector, check=False)
     return sum(line.split()[1] == "Ready" for line in listed.splitlines())

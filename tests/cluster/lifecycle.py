@@ -54,7 +54,7 @@ def _record() -> Path:
 
 
 def find() -> Found | None:
-    """The cluster that was brought up here and not taken down, whether it is whole or not.
+    """Return the cluster that was started here and not taken down, complete or not.
 
     One of which no process runs any more has ended, with its machine or with who started it: what
     it was in the middle of then is nothing to go on with.
@@ -67,7 +67,7 @@ def find() -> Found | None:
 
 
 def up(count: int) -> None:
-    """See to it that a cluster with at least this many nodes is up and whole.
+    """Ensure that a complete cluster with at least this many nodes is up.
 
     What runs is left alone, what has ended is started again, cables that were cut are mended, and
     what a reboot has torn apart is taken away first. Raises ClusterError where the machine has a
@@ -85,7 +85,7 @@ def up(count: int) -> None:
 
 
 def keep_or_clear() -> Found | None:
-    """The cluster to go on with, or None and nothing is left of one."""
+    """Return the cluster to continue with, or None after all parts of it are removed."""
     found = find()
     if found is None or not network.is_there(found.nodes):
         if _leftovers():
@@ -120,7 +120,7 @@ def _start(count: int) -> None:
             complaints.append(str(error))
     if complaints:
         raise ClusterError("\n".join(complaints))
-    for daemon in all_daemons():  # what is neither plane nor node: KWOK
+    for daemon in all_daemons():  # neither control plane nor node: KWOK
         daemon.start_again()
     wait_for(
         f"{count} nodes that are Ready",
@@ -135,7 +135,7 @@ def _kubelets(count: int) -> list[Daemon]:
 
 
 def down() -> None:
-    """Stop the cluster and delete all that it was; nothing happens when there is none."""
+    """Stop the cluster and delete all its parts; do nothing if there is none."""
     need_root("stop the test cluster")
     with locked(places.LOCK, _BUSY):
         take_down()

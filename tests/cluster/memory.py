@@ -1,4 +1,4 @@
-"""What the machine has left of memory, and whom the kernel killed when there was none."""
+"""Free memory of the machine, and the processes that the kernel killed for lack of it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _MEMORY = Path("/proc/meminfo")
 
 
 def kills(counters: Path | None = None) -> int:
-    """How many processes the kernel has killed for want of memory since the machine began.
+    """Return how many processes the kernel has killed for lack of memory since the machine began.
 
     By its counters of now, or by a copy of them.
     """

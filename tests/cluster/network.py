@@ -20,7 +20,7 @@ _FORWARD = Path("/proc/sys/net/ipv4/ip_forward")
 
 
 def connect(count: int) -> None:
-    """Make the bridge and plug in this many nodes; what is there already is used."""
+    """Make the bridge and connect this many nodes; use those that exist."""
     if not _has_link(places.BRIDGE):
         output("ip", "link", "add", places.BRIDGE, "type", "bridge")
         output("ip", "addr", "add", f"{places.HOST_IP}/24", "dev", places.BRIDGE)
@@ -37,7 +37,7 @@ def connect(count: int) -> None:
 
 
 def _firewall(action: str) -> tuple[str, ...]:
-    """What leaves the cluster is refused at once.
+    """Add or remove the rules that refuse all packets out of the cluster.
 
     Nothing out there would find a way back to our addresses: a registry, or the server that knows
     its name, would be waited for until a limit of time is over.
@@ -73,7 +73,7 @@ def set_cable(index: int, *, up: bool) -> None:
 
 
 def is_plugged_in(index: int) -> bool:
-    """Whether packets reach the node and leave it."""
+    """Return whether packets reach the node and leave it."""
     try:
         flags = Path("/sys/class/net", places.link(index), "flags").read_text()
     except OSError:
@@ -82,7 +82,7 @@ def is_plugged_in(index: int) -> bool:
 
 
 def remove() -> None:
-    """Take away every namespace of a node, and the bridge; nothing happens without them."""
+    """Remove every namespace of a node, and the bridge, if they exist."""
     for cable in Path("/sys/class/net").glob(places.link_prefix() + "*"):
         # A namespace ends some time after its name; its cable must not be there when it comes back.
         output("ip", "link", "delete", cable.name, check=False)
@@ -100,7 +100,7 @@ def namespaces() -> list[str]:
 
 
 def is_there(count: int) -> bool:
-    """Whether the bridge and the namespaces of this many nodes are there."""
+    """Return whether the bridge and the namespaces of this many nodes exist."""
     wanted = {places.namespace(index) for index in range(1, count + 1)}
     return _has_link(places.BRIDGE) and wanted <= set(namespaces())
 

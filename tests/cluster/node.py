@@ -1,4 +1,4 @@
-"""One node: a containerd, a kubelet and a kube-proxy in a network namespace of their own."""
+"""One node: a containerd, a kubelet and a kube-proxy in one network namespace."""
 
 from __future__ import annotations
 

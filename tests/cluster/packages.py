@@ -1,4 +1,4 @@
-"""What the cluster needs from the distribution; installed where root and apt-get are there."""
+"""Distribution packages that the cluster needs; installed where root and apt-get are available."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _SYSTEM_PATH = "/usr/sbin:/usr/bin:/sbin:/bin"
 
 
 def missing(wanted: Mapping[str | Path, str]) -> list[str]:
-    """The packages of what is not there, each once."""
+    """Return the packages of the missing programs, each once."""
     return sorted({package for item, package in wanted.items() if not _is_there(item)})
 
 

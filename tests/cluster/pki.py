@@ -63,7 +63,7 @@ class Pki:
         alternatives = f"subjectAltName={addresses}\n" if addresses else ""
         extensions.write_text(f"extendedKeyUsage=clientAuth,serverAuth\n{alternatives}")
         authority = ("-CA", self.authority.certificate, "-CAkey", self.authority.key)
-        # Certificates are made by several threads, who could not share a file of serial numbers.
+        # Several threads make certificates; they could not share a file of serial numbers.
         number = ("-set_serial", f"0x{secrets.token_hex(8)}")
         files = ("-in", request, "-extfile", extensions, "-out", pair.certificate)
         output("openssl", "x509", "-req", *_VALID, *authority, *number, *files)

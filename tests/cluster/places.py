@@ -1,4 +1,4 @@
-"""Where the cluster keeps its programs, state and sockets, and the addresses that it uses.
+"""Paths of the cluster's programs, state and sockets, and its addresses.
 
 There is one such cluster on a machine: names of bridges, network namespaces and cgroups are the
 machine's. Programs are shared by all checkouts that ask for the same versions.
@@ -16,10 +16,10 @@ CHECKOUT = HERE.parents[1]
 
 
 class Source(NamedTuple):
-    """What one `go build` makes programs of."""
+    """Input of one `go build`."""
 
     folder: str
-    """Of the Go module here that names all versions."""
+    """Folder of the Go module in this repository that names all versions."""
     package: str
     module: str
     """The module whose version is that of the programs."""
@@ -60,7 +60,7 @@ API = f"https://{HOST_IP}:6443"
 
 
 def version(source: str) -> str:
-    """The version, without its v, of what is built of this source."""
+    """Return the version of this source, without its v."""
     folder, module = SOURCES[source].folder, SOURCES[source].module
     text = (HERE / folder / "go.mod").read_text(encoding="utf-8")
     found = re.search(rf"^(?:require |\t){re.escape(module)} v(\S+)", text, re.MULTILINE)

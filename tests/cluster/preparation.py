@@ -1,4 +1,4 @@
-"""What takes minutes the first time, done before the tests: no limit of theirs counts it.
+"""Preparation before the tests, outside their time limits: it takes minutes the first time.
 
 Nothing here is an error of its own. What could not be made ready is said, and said again by the
 tests that need it.

@@ -1,4 +1,4 @@
-"""What killed nodes leave on the machine: containers, mounts, namespaces, cgroups.
+"""Remains of killed nodes on the machine: containers, mounts, namespaces, cgroups.
 
 The state of the cluster is thrown away as a whole, so nothing is asked to end in good order, which
 would take the longer the more pods there are, and would not work after a crash.
@@ -23,7 +23,7 @@ _SHIM = b"containerd-shim-runc-v2"
 
 
 def clear() -> None:
-    """Remove it all. To be called when no containerd and no kubelet of ours runs any more."""
+    """Remove all remains. Call it when no containerd and no kubelet of this cluster runs."""
     for pid in _processes():
         try:
             os.kill(pid, signal.SIGKILL)
@@ -38,7 +38,7 @@ def clear() -> None:
 
 
 def _processes() -> Iterator[int]:
-    """Every process in a pod of ours, and the shims that watch over them."""
+    """Return every process in a pod of this cluster, and the shims that watch over them."""
     for process in Path("/proc").glob("[0-9]*"):
         try:
             words = (process / "cmdline").read_bytes().split(b"\0")

@@ -23,7 +23,7 @@ def output(
     env: Mapping[str, str] | None = None,
     timeout: float | None = None,
 ) -> str:
-    """What a command prints. Raises ClusterError with all that it said when it fails."""
+    """Return a command's output. Raises ClusterError with all its output if it fails."""
     words = [str(word) for word in command]
     try:
         done = subprocess.run(
@@ -42,7 +42,7 @@ def output(
 
 
 def answer(*command: str | Path, timeout: float = 30) -> str:
-    """What a command says, also where it fails or is not there."""
+    """Return a command's output, also if it fails or does not exist."""
     try:
         return output(*command, timeout=timeout)
     except ClusterError as error:
@@ -50,7 +50,7 @@ def answer(*command: str | Path, timeout: float = 30) -> str:
 
 
 def succeeds(*command: str | Path, timeout: float = 30) -> bool:
-    """Whether a command is there and ends with status 0 in time."""
+    """Return whether a command exists and ends with status 0 in time."""
     try:
         output(*command, timeout=timeout)
     except ClusterError:
@@ -82,7 +82,7 @@ def wait_for(
 
 @contextmanager
 def locked(file: Path, meanwhile: str) -> Iterator[None]:
-    """Hold a lock against other processes; says for what it waits when it must."""
+    """Hold a lock against other processes; print the reason if it must wait."""
     file.parent.mkdir(parents=True, exist_ok=True)
     with open(file, "a", encoding="utf-8") as lock:
         try:
@@ -94,7 +94,7 @@ def locked(file: Path, meanwhile: str) -> Iterator[None]:
 
 
 def say(text: str) -> None:
-    """Progress and advice, apart from what a command is asked to print."""
+    """Print progress and advice, apart from the output of a command."""
     print(f"cluster: {text}", file=sys.stderr, flush=True)
 
 

@@ -29,7 +29,7 @@ class SimpleQueue(multiprocessing.queues.SimpleQueue):  # type: ignore[no-redef,
             case "crash":
                 os._exit(3)
             case "leave":
-                # A session of its own, as a daemon has it: no signal to the group reaches it.
+                # A separate session, as a daemon has it: no signal to the group reaches it.
                 script = "import threading; threading.Event().wait()"
                 subprocess.Popen([sys.executable, "-c", script], start_new_session=True)
         super().close()

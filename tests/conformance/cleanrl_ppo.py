@@ -22,21 +22,21 @@ WITHIN = "--within"
 
 
 class PrintedScalars:
-    """In the place of TensorBoard's ``SummaryWriter``: what does not depend on the clock."""
+    """Stand-in for ``SummaryWriter`` of TensorBoard; it ignores values of the clock."""
 
     def __init__(self, _folder: str) -> None:
         pass
 
     def add_scalar(self, name: str, value: Any, step: int) -> None:
-        """As ``SummaryWriter``'s."""
+        """Print the value, exactly."""
         if not name.endswith("SPS"):
             print(f"{step} {name} {float(value).hex()}")
 
     def add_text(self, _name: str, _text: str) -> None:
-        """As ``SummaryWriter``'s."""
+        """Ignore the text."""
 
     def close(self) -> None:
-        """As ``SummaryWriter``'s."""
+        """Do nothing: no file is open."""
 
 
 def within(vector_env: str, program: str) -> None:
@@ -54,7 +54,7 @@ def within(vector_env: str, program: str) -> None:
 
 
 def logged(vector_env: str, program: Path, options: list[str]) -> list[str]:
-    """What it logs."""
+    """Run CleanRL's program in a process and return its logged values."""
     done = subprocess.run(
         [sys.executable, __file__, WITHIN, vector_env, str(program), *OPTIONS, *options],
         stdout=subprocess.PIPE,

@@ -1,4 +1,4 @@
-"""The tests that Fiber does not pass, and why. Each run prints its part of this list.
+"""Tests that Fiber does not pass, with reasons. Each run prints its part of this list.
 
 A test that is listed and passes fails the run as much as one that fails and is not listed: the
 list says what is so.

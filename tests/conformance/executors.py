@@ -31,7 +31,7 @@ JOBS = 3
 
 
 def available() -> bool:
-    """Whether this Python has them: some installations leave them out."""
+    """Return whether this Python has these tests: some installations leave them out."""
     return importlib.util.find_spec("test.test_concurrent_futures") is not None
 
 
@@ -47,7 +47,7 @@ def run_once(backend: str, substring: str = "") -> Verdict:
             groups.setdefault(case["class_name"], []).append(id_)
     with ExitStack() as stack:
         if backend == "kubernetes":
-            from conformance.warm_pools import warm_pools  # needs what the operator does
+            from conformance.warm_pools import warm_pools  # needs the operator's work
 
             pools = stack.enter_context(warm_pools(JOBS, target.variables()))
             target = replace(target, lend=pools.lend)

@@ -52,7 +52,7 @@ EXCLUSIONS = {
 
 
 class AsyncVectorEnv(fiber.vector.VectorEnv):
-    """With the order of arguments, and the arguments, that Gymnasium's has."""
+    """Vector environment with the arguments of Gymnasium's, in its order."""
 
     def __init__(
         self,
@@ -69,7 +69,7 @@ class AsyncVectorEnv(fiber.vector.VectorEnv):
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """What ``main`` hands on."""
+    """Add the options that ``main`` passes on."""
     parser.addoption(ADOPTED, action="store_true")
 
 
@@ -83,7 +83,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """What cannot pass must not."""
+    """Expect listed tests to fail: a listed test that passes is an error."""
     if config.getoption(ADOPTED):
         return
     for item in items:

@@ -1,4 +1,4 @@
-"""What a program asks of Fiber that defines functions and classes in its ``__main__``."""
+"""Program that defines functions and classes in its ``__main__`` and uses them in children."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def send(connection): connection.send(os.getpid())
 triple = lambda x: 3 * x
 
 """
-"""Without blank lines within a block, and with one after it: it can be typed."""
+"""Program without blank lines within a block and with one after it, so that it can be typed."""
 
 CALL = "main_checks.check(globals())\n"
 

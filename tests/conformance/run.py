@@ -89,7 +89,7 @@ def run_once(
     limit: float = LIMIT,
     jobs: int = JOBS,
 ) -> Verdict:
-    """One pass over the selected classes with one backend and one start method."""
+    """Make one pass over the selected classes with one backend and one start method."""
     target = Target(module, method, frozenset(TIERS[backend]), limit, (("FIBER_BACKEND", backend),))
     started = time.monotonic()
     groups, left_out = select(target, substring)

@@ -1,4 +1,4 @@
-"""Runs groups of CPython's tests in interpreters of their own and survives what they do.
+"""Runner of groups of CPython's tests in separate interpreters, which survives hangs and crashes.
 
 One group is one class in one interpreter. A test over its limit is named, every process of the
 group prints its stacks and is killed, and the rest of the group goes on in a new interpreter. What
@@ -39,7 +39,7 @@ _serial = itertools.count()
 
 @dataclass(frozen=True)
 class Target:
-    """What is tested, and how."""
+    """Object under test, and how it is tested."""
 
     module: str
     method: str
@@ -47,7 +47,7 @@ class Target:
     limit: float  # seconds for one test
     environment: tuple[tuple[str, str], ...] = ()
     lend: Callable[[], AbstractContextManager[Mapping[str, str]]] = lambda: nullcontext({})
-    """What an interpreter has for itself while it runs, as variables of its environment."""
+    """Provider of an interpreter's private environment variables, while it runs."""
 
     def variables(self) -> dict[str, str]:
         """The environment of an interpreter that runs tests."""
@@ -65,7 +65,7 @@ class Target:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one test: pass, skip, fail, hang or crash."""
+    """Result of one test: pass, skip, fail, hang or crash."""
 
     id: str
     result: str
@@ -79,7 +79,7 @@ class Outcome:
 
 @dataclass
 class Report:
-    """What became of a group, or of all of them."""
+    """Result of a group, or of all of them."""
 
     outcomes: list[Outcome] = field(default_factory=list)
     fallbacks: set[str] = field(default_factory=set)
@@ -139,7 +139,7 @@ def _is_test(id_: str) -> bool:
 
 
 class _Interpreter:
-    """One interpreter with some tests; `reached` is how many of them need no other one."""
+    """Run of some tests in one interpreter; `reached` is how many of them need no other one."""
 
     def __init__(self, target: Target, ids: Sequence[str]) -> None:
         self.target = target

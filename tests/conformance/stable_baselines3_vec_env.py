@@ -50,7 +50,7 @@ def pytest_configure() -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Without torch nothing learns."""
+    """Skip learning: it needs torch."""
     torch = importlib.util.find_spec("torch")
     if torch is not None and torch.origin is not None and STAND_INS in Path(torch.origin).parents:
         for item in items:

@@ -1,4 +1,4 @@
-"""Fiber passes CPython's own multiprocessing tests, but for those that `exclusions` explains."""
+"""Run CPython's own multiprocessing tests on Fiber, except those that `exclusions` explains."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""fiber.Executor passes CPython's own tests of executors, but for those that are listed."""
+"""Run CPython's own tests of executors on fiber.Executor, except the listed ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The harness finds what it is there to find: hangs, crashes, leftovers, stale exclusions."""
+"""Harness tests: it finds hangs, crashes, leftovers and stale exclusions."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_a_module_that_cannot_be_loaded_is_said_at_once() -> None:
 
 
 def test_a_python_without_its_tests_is_told(tmp_path: Path) -> None:
-    # As distributions leave it that have them in a package of their own.
+    # Some distributions put the tests into a separate package.
     (tmp_path / "test").mkdir()
     (tmp_path / "test" / "__init__.py").touch()
     path = ("PYTHONPATH", os.pathsep.join([str(tmp_path), str(TESTS)]))

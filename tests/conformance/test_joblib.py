@@ -1,4 +1,4 @@
-"""Fiber's backend passes joblib's own tests of one, but for those that `exclusions` explains."""
+"""Run joblib's own backend tests on Fiber's backend, except those that `exclusions` explains."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_joblibs_tests(backend: str, tmp_path: Path, monkeypatch: pytest.MonkeyP
     variables = {**os.environ, "FIBER_BACKEND": backend, "PYTHONPATH": str(TESTS)}
     with ExitStack() as stack:
         if backend == "kubernetes":
-            from conformance.warm_pools import warm_pools  # needs what the operator does
+            from conformance.warm_pools import warm_pools  # needs the operator's work
 
             # Played: pods of a real one need an image with joblib and pytest.
             monkeypatch.delenv("KUBECONFIG", raising=False)

@@ -21,7 +21,7 @@ LIMIT = 60
 pytestmark = pytest.mark.timeout(LIMIT)
 
 ONCE = "top level of __main__\n"
-"""What a program prints whose children need not, or must not, import it."""
+"""Output of a program whose children need not, or must not, import it."""
 
 
 class Programs:
@@ -43,7 +43,7 @@ class Programs:
         }
 
     def run(self, *arguments: str, **options: Any) -> str:
-        """What the interpreter prints with these arguments."""
+        """Return the interpreter's output with these arguments."""
         done: subprocess.CompletedProcess[str] = subprocess.run(
             [sys.executable, *arguments],
             cwd=self.folder,
@@ -124,7 +124,7 @@ def test_under_a_debugger(programs: Programs) -> None:
 
 
 def typed(programs: Programs, *arguments: str, **environment: str) -> str:
-    """What a terminal shows in which the program is typed to the interpreter."""
+    """Return the text of a terminal in which the program is typed to the interpreter."""
     programs.environment.update(environment)
     ours, theirs = pty.openpty()
     with os.fdopen(ours, "r+b", buffering=0) as terminal:
@@ -150,7 +150,7 @@ def _read_to_the_end(terminal: IO[bytes]) -> str:
     while True:
         try:
             data = terminal.read(1 << 16)
-        except OSError:  # EIO: nobody has the terminal open any more
+        except OSError:  # EIO: no process has the terminal open
             data = b""
         if not data:
             return shown.decode().replace("\r\n", "\n")

@@ -1,4 +1,4 @@
-"""Each interpreter that runs tests on pods has a pool for itself that nobody holds."""
+"""Warm pools: each interpreter that runs tests on pods has one that no other holds."""
 
 from __future__ import annotations
 

@@ -78,7 +78,7 @@ LEFT_OUT = {
 }
 
 SECONDS = 600
-"""For one example: bench_queue sends two million messages."""
+"""Limit for one example: bench_queue sends two million messages."""
 
 
 STAND_INS = Path(__file__).parents[1] / "stand_ins" / "original"

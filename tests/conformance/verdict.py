@@ -13,7 +13,7 @@ _GOOD = ("pass", "skip")
 
 @dataclass(frozen=True)
 class Verdict:
-    """One run against one list of exclusions (id -> reason); what was not run, and why."""
+    """Comparison of one run with one list of exclusions (id -> reason), and the tests left out."""
 
     title: str
     report: Report
@@ -23,12 +23,12 @@ class Verdict:
 
     @property
     def failures(self) -> list[Outcome]:
-        """What did not pass and is not listed."""
+        """Tests that did not pass and are not listed."""
         return [o for o in self.report.outcomes if self.judge(o) == "failed"]
 
     @property
     def stale(self) -> list[Outcome]:
-        """What is listed and passed."""
+        """Tests that are listed and passed."""
         return [o for o in self.report.outcomes if o.result == "pass" and o.id in self.exclusions]
 
     @property
@@ -81,7 +81,7 @@ class Verdict:
 
 
 def _shortened(detail: str) -> str:
-    """Whole lines, but for those in which a test prints the megabyte that it sent."""
+    """Return whole lines, except those in which a test prints the megabyte that it sent."""
     lines = (line if len(line) <= 300 else f"{line[:300]} ..." for line in detail.splitlines())
     return "\n".join(lines).strip()
 

@@ -62,7 +62,7 @@ def warm_pools(count: int, variables: Mapping[str, str]) -> Iterator[WarmPools]:
 class _Pool:
     name: str
     port: socket.socket | None
-    """Where its masters listen, one after the other, where no Service leads to them."""
+    """Port where its masters listen, one after the other, if no Service leads to them."""
 
     @property
     def address(self) -> str:
@@ -71,7 +71,7 @@ class _Pool:
 
 
 class WarmPools:
-    """Those of one run."""
+    """Pools of one run."""
 
     def __init__(
         self,
@@ -99,7 +99,7 @@ class WarmPools:
 
     @contextmanager
     def lend(self) -> Iterator[Mapping[str, str]]:
-        """What an interpreter needs in its environment to have one of the pools for itself."""
+        """Yield the environment that gives an interpreter one of the pools."""
         pool = self._free.get()
         given = {**self._given, "FIBER_POOL": pool.name, "FIBER_NAMESPACE": self._namespace}
         if pool.port is not None:
@@ -109,7 +109,7 @@ class WarmPools:
             yield given
         finally:
             if self._read(pool)["spec"].get("master"):
-                # The interpreter was killed: until its Lease ends the pool is nobody else's.
+                # The interpreter was killed: until its Lease ends, no other one gets the pool.
                 self._delete(pool)
                 self.fill(1)
             else:

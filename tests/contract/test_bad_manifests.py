@@ -1,4 +1,7 @@
-"""What the API server refuses, the models refuse too, in words that name the field."""
+"""Comparison of the models with the API server:
+
+both refuse the same manifests and name the field.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,7 @@ def test_a_rule_that_is_broken_is_named(bad: Bad) -> None:
 
 @pytest.mark.parametrize("update", BAD_UPDATES, ids=lambda update: update.name)
 def test_rules_about_a_change_leave_both_ends_alone(update: BadUpdate) -> None:
-    # A reader of one object cannot know what it was before.
+    # A reader of one object does not know its earlier state.
     assert FiberPool.read(update.first()) != FiberPool.read(update.second())
 
 
@@ -36,5 +39,5 @@ def test_an_epoch_below_one_that_was_is_refused() -> None:
     assert FiberPool.read({**pool, "status": {"masterEpoch": 2}}).status.master_epoch == 2
     with pytest.raises(InvalidPool, match=r"spec\.master\.epoch: must not be below status"):
         FiberPool.read({**pool, "status": {"masterEpoch": 3}})
-    # With the master gone, what it had is only remembered.
+    # Without the master, only the record of its work remains.
     assert FiberPool.read({**GOOD, "status": {"masterEpoch": 3}}).spec.master is None

@@ -50,7 +50,7 @@ def test_a_manifest_is_a_pool_called_like_its_file(path: Path) -> None:
     pool = FiberPool.read(document)
     assert pool.metadata.name == path.stem
     assert unknown(document["spec"], schema()["properties"]["spec"], "spec") == []
-    # What the program owns stands in no manifest that is applied again and again.
+    # A manifest that is applied again and again contains no field that the program owns.
     assert not {"replicas", "master"} & set(document["spec"])
 
 

@@ -1,4 +1,4 @@
-"""What things are called, and how long that may get."""
+"""Names of objects, and their limits of length."""
 
 from __future__ import annotations
 

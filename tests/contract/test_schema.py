@@ -121,14 +121,14 @@ def test_every_node_is_structural() -> None:
 def test_every_field_can_be_explained() -> None:
     for path, node in NODES.items():
         if path == ".metadata" or path.endswith("[]"):
-            continue  # the API server's own, and items, of which the list says what they are
+            continue  # the API server's own fields, and items, whose type the list gives
         assert node["description"].endswith("."), path
         assert " ".join(node["description"].split()) == node["description"], path
 
 
 def test_what_rules_look_at_has_a_limit() -> None:
-    # The API server estimates what a rule may cost at worst, and refuses a schema that might be
-    # expensive.  Values that would be absurd are refused too.
+    # The API server estimates the highest cost of a rule, and refuses a schema that might be
+    # expensive. It refuses absurd values too.
     for path, node in NODES.items():
         if not path.startswith(".spec"):
             continue
@@ -222,6 +222,7 @@ def test_a_rule_reads_fields_that_are_there(path: str, rule: dict[str, str]) -> 
         assert f"{path}{found}" in NODES
         parent, _, name = f"{path}{found}".rpartition(".")
         required = name in NODES[parent].get("required", ())
-        # When the API server checks a default of the whole, those of its fields are not yet there.
+        # When the API server checks a default of the whole object, the defaults of its fields are
+        # not there.
         filled_in = "default" in NODES[path + found] and "default" not in NODES[parent]
         assert required or filled_in or f"!has(self{found})" in rule["rule"], found

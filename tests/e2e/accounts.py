@@ -25,7 +25,7 @@ def may_use_pools(scene: Scene) -> None:
 
 
 def may_read_credentials(scene: Scene, pool: str) -> None:
-    """What a warm pool needs beyond that, as the chart's README has it."""
+    """Grant the rights that a warm pool needs beyond fiber-user's, as the chart's README says."""
     secret = f"--resource-name={names.secret_name(pool)}"
     account = f"--serviceaccount={scene.namespace}:{ACCOUNT}"
     for arguments in (

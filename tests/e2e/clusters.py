@@ -42,7 +42,7 @@ NODES = 2
 
 
 class NoCluster(Exception):
-    """There is none and none can be made; the message says why, and what would help."""
+    """Lack of a cluster: the message gives the reason and the remedy."""
 
 
 class Cluster:
@@ -56,14 +56,16 @@ class Cluster:
     images: Mapping[str, str]
     """The reference of each of images.IMAGES, as a pod names it."""
     by_version: bool = False
-    """Whether its nodes have these images under the version too, as chart and manifests name it."""
+    """True if its nodes have these images under the version too, as chart and manifests name
+    it.
+    """
     outside: str | None = None
-    """Where pods reach a program that runs beside the tests; None where they cannot."""
+    """Address at which pods reach a program that runs beside the tests; None if they cannot."""
     node_lost_after: float = 60
     """Seconds after which a silent node is surely NotReady."""
 
     def kubectl(self, *arguments: str, check: bool = True) -> str:
-        """What kubectl prints. Raises ClusterError with what it complains about."""
+        """Return kubectl's output. Raises ClusterError with its error."""
         command = (find_program("kubectl"), "--kubeconfig", self.kubeconfig)
         return output(*command, *arguments, check=check, timeout=120)
 
@@ -80,7 +82,7 @@ class Cluster:
         self._wait_until_ready(node)
 
     def closed(self, node: str) -> AbstractContextManager[Callable[[Allowed], None]]:
-        """Nothing reaches the node's pods meanwhile, and they reach what is then allowed.
+        """Drop packets to the node's pods meanwhile; the pods reach only the allowed targets.
 
         Connections that there are go on.
         """
@@ -88,7 +90,7 @@ class Cluster:
 
     @contextlib.contextmanager
     def without_apiserver(self) -> Iterator[None]:
-        """Nobody gets an answer from the API server meanwhile; then it is ready again."""
+        """Stop the API server's answers meanwhile; then it is ready again."""
         with self._without_apiserver():
             yield
         self.kubectl("get", "--raw", "/readyz")
@@ -251,7 +253,7 @@ class Kind(Cluster):
 
 
 class Given(Cluster):
-    """A cluster of somebody else, left as it is but for what the tests install and remove."""
+    """Cluster of somebody else, on which the tests remove all that they installed."""
 
     def __init__(self, kubeconfig: Path, environment: Mapping[str, str]) -> None:
         self.description = f"the cluster of {kubeconfig}"

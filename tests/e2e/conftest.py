@@ -23,7 +23,7 @@ from fiber_api import names
 
 RELEASE = "fiber-e2e"
 LABEL = "fiber.dev/e2e"
-# Seconds for one test, without what is brought up for all of them: programs may have to be built.
+# Seconds for one test, without the fixtures that all tests share: programs may have to be built.
 LIMIT = 120
 _NO_CLUSTER = pytest.StashKey[str]()
 _RELEASE = pytest.StashKey[Release]()
@@ -84,7 +84,7 @@ def release(
     uncordon(kube)
     _remove_namespaces(kube)
     release.uninstall()  # of a session that was killed, perhaps while Helm was at work
-    # Where the last session ended just now it is about to go, and takes nothing in.
+    # The namespace may still be terminating after the last session, and then accepts no objects.
     kube.kubectl("delete", "namespace", RELEASE, "--ignore-not-found", "--timeout=120s")
     release.install()
     pytestconfig.stash[_RELEASE] = release

@@ -65,7 +65,7 @@ def path_of(resource: str, namespace: str = "", name: str = "", subresource: str
 
 
 def run(program: str, *arguments: str | Path, stdin: str = "", seconds: float = _PATIENCE) -> str:
-    """What a program prints; Failed with what it complains about."""
+    """Return a program's output; raise Failed with its error."""
     command = [program, *map(str, arguments)]
     done = subprocess.run(command, input=stdin, capture_output=True, text=True, timeout=seconds)
     if done.returncode:
@@ -74,7 +74,7 @@ def run(program: str, *arguments: str | Path, stdin: str = "", seconds: float = 
 
 
 class Kube:
-    """One cluster's API.  Every method may be called from any thread."""
+    """API of one cluster. Every method may be called from any thread."""
 
     def __init__(self, kubeconfig: Path) -> None:
         self.kubeconfig = kubeconfig
@@ -94,7 +94,7 @@ class Kube:
 
     @property
     def url(self) -> str:
-        """Where the API is served without a login."""
+        """Address where the API is served without a login."""
         return f"http://{self.host}:{self.port}"
 
     def close(self) -> None:
@@ -103,7 +103,7 @@ class Kube:
         self._proxy.communicate()
 
     def kubectl(self, *arguments: str, stdin: str = "") -> str:
-        """What kubectl prints."""
+        """Return kubectl's output."""
         return run(self._kubectl, "--kubeconfig", self.kubeconfig, *arguments, stdin=stdin)
 
     def apply(self, manifest: Body, *arguments: str) -> str:
@@ -133,7 +133,7 @@ class Kube:
         return self.call("PATCH", path, body, kind=kind, query=query)
 
     def delete(self, path: str, body: Body | None = None) -> None:
-        """Delete what is there; nothing happens where nothing is."""
+        """Delete an object if it exists."""
         try:
             self.call("DELETE", path, body)
         except Refused as refused:
@@ -141,7 +141,7 @@ class Kube:
                 raise
 
     def text(self, path: str, **query: str) -> str:
-        """What is served there, a log for example."""
+        """Return the text at a path, a log for example."""
         return self._send("GET", path, None, "", query).decode(errors="replace")
 
     def call(
@@ -153,7 +153,7 @@ class Kube:
         kind: str = "application/json",
         query: Mapping[str, str] | None = None,
     ) -> Body:
-        """One request; the document in its answer."""
+        """Send one request and return the document in its answer."""
         answer: Body = json.loads(self._send(method, path, body, kind, query or {}))
         return answer
 
@@ -175,7 +175,7 @@ class Kube:
 
 
 class Stream:
-    """Lines that a server goes on sending, told to ``tell`` by a thread until ``close``.
+    """Lines of a long answer, which a thread passes to ``tell`` until ``close``.
 
     ``begin`` says anew for each connection what to ask for, or None to end.
     """
@@ -193,7 +193,7 @@ class Stream:
         self._thread.start()
 
     def close(self) -> None:
-        """Tell nothing more, and end the thread."""
+        """Stop the calls of ``tell``, and end the thread."""
         with self._lock:
             self._closed.set()
             if self._socket is not None:
@@ -210,7 +210,7 @@ class Stream:
                 for line in self._lines(path):
                     self._tell(line)
             except (OSError, http.client.HTTPException, Refused):
-                pass  # the API server may be away; what it would say is asked for again
+                pass  # the API server may be away; the next request gets the same lines
             self._closed.wait(_PAUSE)
 
     def _lines(self, path: str) -> Iterator[str]:
@@ -245,5 +245,5 @@ def _message(data: bytes) -> str:
 
 
 def environment(**more: str) -> dict[str, str]:
-    """This process's, with some variables set."""
+    """Return this process's environment with some variables set."""
     return {**os.environ, **more}

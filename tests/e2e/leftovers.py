@@ -1,4 +1,4 @@
-"""What programs leave in their namespaces: nothing."""
+"""Check that programs leave no objects in their namespaces."""
 
 from __future__ import annotations
 

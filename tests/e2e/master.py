@@ -42,7 +42,7 @@ IDENTITY = f"{socket.gethostname()}:{os.getpid()}"
 
 
 class Api:
-    """What a master asks of the API server."""
+    """Client for a master's requests to the API server."""
 
     def __init__(self, namespace: str, pool: str) -> None:
         self._token = ""
@@ -120,7 +120,7 @@ class Api:
 
 
 class Agent:
-    """Hears of one agent."""
+    """Observer of one agent."""
 
     def __init__(self, link: Link, loop: Loop, say: Any) -> None:
         self._name, self._loop, self._link, self._say = link.peer.name, loop, link, say

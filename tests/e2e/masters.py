@@ -18,7 +18,7 @@ PROGRAM = Path(__file__).with_name("master.py")
 
 
 class Master:
-    """What a master has said so far."""
+    """Output of a master so far."""
 
     def __init__(self, pool: Pool) -> None:
         self.pool = pool
@@ -26,7 +26,7 @@ class Master:
 
     @property
     def joined(self) -> dict[str, float]:
-        """When each agent dialled in, in seconds since the master attached."""
+        """Return when each agent dialled in, in seconds since the master attached."""
         return {said["name"]: said["at"] for said in self.said if said["event"] == "joined"}
 
     @property

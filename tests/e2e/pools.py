@@ -21,19 +21,19 @@ def template(image: str, *command: str, **container: Any) -> Body:
     }
     if command:
         worker["command"] = list(command)
-    # What has no signal handler as process 1 hears no SIGTERM, and would be waited for.
+    # Process 1 without a signal handler ignores SIGTERM, and the test would wait for it.
     return {"spec": {"terminationGracePeriodSeconds": 2, "containers": [worker]}}
 
 
 class Pool:
-    """One FiberPool.  Everything that is read is as the scene's watches have it."""
+    """One FiberPool. All reads come from the scene's watches."""
 
     def __init__(self, scene: Scene, name: str) -> None:
         self.scene = scene
         self.name = name
         self._path = scene.path("fiberpools", name)
 
-    # What a person and the SDK do
+    # Actions of a person and of the SDK
 
     def apply(self, pod_template: Body, **spec: Any) -> Pool:
         """``kubectl apply`` of a manifest."""
@@ -103,7 +103,7 @@ class Pool:
 
     @property
     def names(self) -> set[str]:
-        """Of its live pods."""
+        """Return the names of its live pods."""
         return {pod["metadata"]["name"] for pod in self.live}
 
     @property
@@ -122,7 +122,7 @@ class Pool:
 
     @property
     def seen_generation(self) -> bool:
-        """Whether the status is about the spec that is there now."""
+        """Return whether the status is about the current spec."""
         generation = self.body.get("metadata", {}).get("generation")
         return generation is not None and self.status.get("observedGeneration") == generation
 
@@ -132,7 +132,7 @@ class Pool:
         return self.scene.wait(f"{self.name}: {what}", condition, seconds)
 
     def ready(self, replicas: int, seconds: float = 30.0) -> Sequence[str]:
-        """Wait until the status says that so many are ready and nothing else is under way."""
+        """Wait until the status shows this many ready workers and no other change under way."""
 
         def settled() -> bool:
             status = self.status
@@ -183,7 +183,7 @@ def condition_in(pool: Body, kind: str) -> Body:
 
 
 def says(text: str, *words: str) -> bool:
-    """Whether all the words are in it, in this order."""
+    """Return whether the text contains all the words, in this order."""
     place = 0
     for word in words:
         place = text.find(word, place)
@@ -193,7 +193,7 @@ def says(text: str, *words: str) -> bool:
 
 
 def is_live(pod: Body) -> bool:
-    """Whether it counts as a replica."""
+    """Return whether the pod counts as a replica."""
     ended = pod.get("status", {}).get("phase") in ("Failed", "Succeeded")
     return not ended and "deletionTimestamp" not in pod["metadata"]
 
@@ -211,7 +211,7 @@ def state_of(pod: Body) -> Body:
 
 
 def waits_for(*reasons: str) -> Callable[[Body], bool]:
-    """Whether a container of a pod waits, and the kubelet gives one of these reasons."""
+    """Return whether a container of a pod waits, and the kubelet gives one of these reasons."""
     return lambda pod: any(
         state.get("waiting", {}).get("reason") in reasons for state in _states(pod)
     )
@@ -225,5 +225,5 @@ def _states(pod: Body) -> list[Body]:
 
 
 def has_ended(pod: Body) -> bool:
-    """Whether its worker has ended."""
+    """Return whether its worker has ended."""
     return "terminated" in state_of(pod)

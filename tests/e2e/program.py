@@ -24,7 +24,7 @@ from e2e.kube import Body, Stream
 from e2e.scene import Scene
 
 PLACES = ("inside", "outside")
-"""In a pod of the cluster, with an account; beside the tests, with a kubeconfig."""
+"""Places of a program: in a pod, with an account, or beside the tests, with a kubeconfig."""
 PROGRAMS = Path(__file__).with_name("programs")
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 CONTAINER = "program"
@@ -32,7 +32,7 @@ _MOUNT = "/program"
 
 
 class Program:
-    """What it has printed so far, and how it ended. Standard output and errors are one."""
+    """Program with its output so far, and how it ended. Standard output and errors are one."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
@@ -44,7 +44,7 @@ class Program:
 
     @property
     def status(self) -> int | None:
-        """Its exit status, negative for a signal; None while it runs or its words are read."""
+        """Exit status, negative for a signal; None while it runs or its output is read."""
         raise NotImplementedError
 
     @property
@@ -61,7 +61,7 @@ class Program:
         """Wait until it has said this, which must be before it ends."""
 
         def heard() -> Body | None:
-            has_ended = self.status is not None  # looked at first: what is said later is not missed
+            has_ended = self.status is not None  # read first, so that later output is not missed
             if found := [said for said in self.said if said["event"] == event]:
                 return found[-1]
             assert not has_ended, f"ended with {self.status}:\n{self.output}"
@@ -81,15 +81,15 @@ class Program:
         return self.output
 
     def kill(self) -> None:
-        """SIGKILL; nothing happens where it has ended."""
+        """Send SIGKILL; do nothing if it has ended."""
         raise NotImplementedError
 
     def interrupt(self) -> None:
-        """What Ctrl-C does."""
+        """Interrupt it as Ctrl-C does."""
         raise NotImplementedError
 
     def close(self) -> None:
-        """Kill it if it runs, and hear no more of it."""
+        """Kill it if it runs, and stop reading its output."""
         raise NotImplementedError
 
     def _wait(self, what: str, condition: Callable[[], Any], seconds: float) -> Any:
@@ -104,14 +104,14 @@ class Program:
 
 
 class Outside(Program):
-    """A process beside the tests, in a process group of its own."""
+    """Process beside the tests, in a separate process group."""
 
     def __init__(
         self, scene: Scene, script: Path, arguments: Sequence[str], environment: dict[str, str]
     ) -> None:
         super().__init__(scene)
         self._status: int | None = None
-        # Of its own: one that is killed leaves its temporary files.
+        # A private folder, because a killed program leaves its temporary files.
         self._temporary = tempfile.TemporaryDirectory(prefix="program-")
         self._process = subprocess.Popen(
             [sys.executable, str(script), *arguments],
@@ -226,7 +226,7 @@ class Inside(Program):
         return f"{self.scene.path('pods', self._name, 'log')}?follow=true&container={CONTAINER}"
 
     def _repeat(self, line: str) -> None:
-        """Hear what was not heard before the connection broke."""
+        """Append a line that was missed when the connection broke."""
         self._heard += 1
         if self._heard > len(self.lines) and line.endswith("\n"):
             self._hear(line)
@@ -272,17 +272,17 @@ class Programs:
         self.scene = scene
         self._cluster = cluster
         self.kubeconfig = kubeconfig_of(scene, home)
-        """Of what is started beside the tests from now on."""
+        """Kubeconfig of later programs beside the tests."""
         self.node: str | None = None
-        """Where what is started inside from now on runs; None: anywhere."""
+        """Node on which later programs inside run; None: any."""
         self.claims: tuple[str, ...] = ()
         """PersistentVolumeClaims that what is started inside from now on mounts."""
         self.image: str | None = None
-        """What is started from now on runs in pods of this image; None: of one of ours."""
+        """Image of later programs inside; None: one of the project's."""
         self._started: list[Program] = []
 
     def start(self, place: str, script: str, *arguments: object, **settings: object) -> Program:
-        """One of ``programs`` or, with a folder in its name, of the examples; see `PLACES`.
+        """Start one of ``programs`` or, with a folder in its name, an example; see `PLACES`.
 
         The settings are keys of Fiber's configuration.
         """
@@ -295,7 +295,7 @@ class Programs:
         return program
 
     def outside(self, script: str, *arguments: object, **settings: object) -> Outside:
-        """Beside the tests, with what is only possible there."""
+        """Start it beside the tests, with options that are only possible there."""
         program = self.start("outside", script, *arguments, **settings)
         assert isinstance(program, Outside)
         return program
@@ -328,7 +328,7 @@ class Programs:
 
 
 def local(script: str, *arguments: object) -> list[str]:
-    """What it prints where it runs on this machine alone."""
+    """Return the output of a script with the local backend."""
     command = [sys.executable, str(path_to(script)), *map(str, arguments)]
     environment = {**_without_fiber(), "FIBER_BACKEND": "local"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)

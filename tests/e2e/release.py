@@ -17,7 +17,7 @@ from fiber_api import names
 
 CHART = Path(__file__).resolve().parents[2] / "charts" / "fiber-operator"
 LEASE_SECONDS = 6
-"""The shortest that there is: what a killed operator's successor waits for."""
+"""Shortest possible Lease: the successor of a killed operator waits for it."""
 
 Values = Mapping[str, Any]
 _CALLS = "fiber_operator_api_requests_total"
@@ -67,7 +67,10 @@ class Release:
             return self.helm(*command, self.name, CHART, *arguments)
 
     def uninstall(self) -> str:
-        """Remove it and wait until its pod is gone, so that nobody acts any more; Helm's words."""
+        """Remove the release and wait until its pod is gone, so no operator acts.
+
+        Return Helm's output.
+        """
         self.note_refusals()
         said = self.helm(
             "uninstall", self.name, "--namespace", self.namespace, "--ignore-not-found"
@@ -76,20 +79,20 @@ class Release:
         return said
 
     def helm(self, *arguments: str | Path, seconds: float = 120) -> str:
-        """What Helm prints."""
+        """Return Helm's output."""
         folders = [f"HELM_{kind}_HOME={self._home}" for kind in ("CACHE", "CONFIG", "DATA")]
         login = ("--kubeconfig", self._kube.kubeconfig)
         return run("env", *folders, self._helm, *arguments, *login, seconds=seconds)
 
     def kubectl(self, *arguments: str) -> str:
-        """What kubectl prints, in the release's namespace."""
+        """Return kubectl's output in the release's namespace."""
         return self._kube.kubectl("--namespace", self.namespace, *arguments)
 
     # The operator
 
     @property
     def deployment(self) -> str:
-        """Its name, which the operator's Lease has too."""
+        """Name of the release, which the operator's Lease has too."""
         return f"{self.name}-fiber-operator"
 
     @property
@@ -98,7 +101,7 @@ class Release:
         return f"app.kubernetes.io/instance={self.name}"
 
     def may(self, verb: str, resource: str, namespace: str) -> bool:
-        """Whether the operator's account has this right there."""
+        """Return whether the operator's account has this right there."""
         return self._may(verb, resource, "--namespace", namespace)
 
     def _may(self, *what: str) -> bool:
@@ -170,7 +173,7 @@ class Release:
         return self._may(verb, resource, "--subresource", part, "--all-namespaces")
 
     def page(self, name: str, pod: Body) -> str:
-        """What an operator's pod serves."""
+        """Return the document that an operator's pod serves."""
         (port,) = pod["spec"]["containers"][0]["ports"]
         place = f"{pod['metadata']['name']}:{port['containerPort']}"
         return self._kube.text(path_of("pods", self.namespace, place, f"proxy/{name}"))
@@ -183,12 +186,12 @@ class Release:
         return seen and updated and [is_ready(pod) for pod in self.pods()] == [True]
 
     def scale(self, replicas: int) -> None:
-        """Have so many operators, of which one acts."""
+        """Run this many operators, of which one acts."""
         path = path_of("deployments", self.namespace, self.deployment, "scale")
         self._kube.patch(path, {"spec": {"replicas": replicas}})
 
     def wait(self, what: str, condition: Any) -> None:
-        """Wait until it is true of the operator's pods, or of what they serve."""
+        """Wait until the condition holds for the operator's pods or their answers."""
         scene = Scene(self._kube, self.namespace, ("pods", "deployments"))
         try:
             scene.wait(what, condition, 60.0, poll=0.5)
@@ -198,7 +201,7 @@ class Release:
             scene.close()
 
     def _account(self) -> str:
-        """What keeps the operators from being ready, in their own words."""
+        """Return why the operators are not ready, in their own words."""
         lines = [self.kubectl("get", "deployments,pods", "--output", "wide")]
         for pod in self.pods():
             try:

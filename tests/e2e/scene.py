@@ -1,4 +1,4 @@
-"""One namespace, watched: what is there now, and when each thing came to be so."""
+"""Watched namespace: its current objects, and when each reached its state."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from fiber_api.names import LABEL_POOL
 
 T = TypeVar("T")
 _LINES = 150
-"""Of each thing that a failed test shows."""
+"""Lines of each part that a failed test shows."""
 _WATCHED = ("fiberpools", "pods", "endpointslices")
 
 
 @dataclass(frozen=True)
 class Moment:
-    """One change, and when it was heard of."""
+    """One change, and when the watch reported it."""
 
     at: float
     """Seconds of the monotonic clock."""
@@ -70,7 +70,7 @@ class Scene:
     def wait(
         self, what: str, condition: Callable[[], T], seconds: float = 30.0, poll: float = 10.0
     ) -> T:
-        """What ``condition`` returns, once that is true.
+        """Return the value of ``condition`` once it is true.
 
         It is asked again after each change, and every ``poll`` seconds.
         """
@@ -92,7 +92,7 @@ class Scene:
         raise AssertionError(f"it must not be so: {what}")
 
     def first(self, resource: str, condition: Callable[[Body], object]) -> float:
-        """When an object was first seen of which the condition is true."""
+        """Return when an object was first seen for which the condition is true."""
         return next(
             moment.at
             for moment in list(self.moments)
@@ -157,7 +157,7 @@ class Scene:
     # For a person
 
     def account(self) -> Iterator[tuple[str, str]]:
-        """What a failed test shows: a title and a text each."""
+        """Yield the parts of a failed test's report: a title and a text each."""
         where = ("--namespace", self.namespace)
         for title, arguments in (
             ("pools", ("get", "fiberpools", "--output", "yaml")),

@@ -52,7 +52,7 @@ ASKED = {
     "another account": (of_pod(serviceAccountName="master"), "ServiceAccount"),
     "another account, by its old name": (of_pod(serviceAccount="master"), "ServiceAccount"),
 }
-"""What is merged into a good template, and a word of why the policy refuses it."""
+"""Changes of a good template, and a word of the policy's refusal."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -160,7 +160,7 @@ def test_a_program_is_told_what_the_policy_refuses(
 
 
 def test_a_program_in_a_pod_passes(guarded: Scene, programs: Programs) -> None:
-    """Its workers have its account, which is its own."""
+    """Workers have the pool's own account."""
     program = programs.start("inside", "mapping.py", "--tasks", 60)
     assert program.says("done")["total"] == squares(60)
     program.ends()

@@ -1,4 +1,4 @@
-"""What a person does with kubectl, and what kubectl tells."""
+"""Check kubectl's commands for pools and their output."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from e2e.scene import Scene
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples" / "manifests"
 SOMEWHERE: Body = {"host": "10.0.3.7", "port": 41337, "epoch": 1, "identity": "somebody"}
-"""A master that nobody can tell to be absent: it has no Lease."""
+"""Master without a Lease: its absence cannot be noticed."""
 
 
 def example(name: str, image: str) -> Body:
-    """An example as it is printed, but for the image."""
+    """Return an example as printed, except the image."""
     manifest: dict[str, Any] = yaml.safe_load((EXAMPLES / f"{name}.yaml").read_text())
     (worker,) = manifest["spec"]["template"]["spec"]["containers"]
     worker["image"] = image
@@ -41,7 +41,7 @@ def test_the_minimal_example_gives_workers(scene: Scene, image: str) -> None:
     pool = Pool(scene, "minimal")
     scene.kube.apply(example("minimal", image), "--namespace", scene.namespace)
     pool.ready(2)
-    # Of a pool that says nothing of replicas too, or no autoscaler could read it.
+    # Also of a pool that does not set replicas, or no autoscaler could read it.
     scale = pool.scene.kube.get(pool.scene.path("fiberpools", pool.name, "scale"))
     assert scale is not None
     assert scale["status"]["replicas"] == 2
@@ -99,7 +99,7 @@ def test_kubectl_scales_a_warm_pool_between_its_bounds(pool: Pool, agent: Body) 
     assert says(limited["message"], "9", "maxReplicas", "3")
     pool.scale(0)
     assert set(pool.ready(1)) < {*two, *pool.ever}
-    # As if nobody had said anything: the minimum is no limit to that.
+    # As if replicas had not been set: the minimum does not limit that.
     assert pool.condition("ScalingLimited")["reason"] == "WithinBounds"
     assert pool.scene.most_at_once(is_live) == 3
 

@@ -17,7 +17,7 @@ from e2e.test_program import workers
 pytestmark = pytest.mark.timeout(240, func_only=True)
 
 AGENT = {"/proc/1/environ", "/proc/1/mem"}
-"""What must stay closed: the agent is the first process of its container."""
+"""Files of the agent, the first process of its container, that tasks must not open."""
 
 STRANGER = """
 import json, os, pathlib, socket, ssl, subprocess, sys

@@ -26,7 +26,7 @@ NO_MODEL = "import sys; print('reading the model'); sys.exit('model.pt: no such 
 
 @pytest.fixture(scope="module")
 def pools(module_scene: Scene, image: str) -> Pools:
-    """One for each way to be bad, of one worker each."""
+    """Make one pool with one worker for each way to be bad."""
     templates: dict[str, Body] = {
         "bad-image": template("registry.invalid/none:1"),
         "bad-name": template("Not/An:Image:Name"),

@@ -1,4 +1,4 @@
-"""CPython's own tests of multiprocessing and of executors, every process of theirs in a pod."""
+"""Run CPython's own tests of multiprocessing and executors with every process in a pod."""
 
 from __future__ import annotations
 

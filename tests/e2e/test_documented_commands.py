@@ -40,7 +40,7 @@ SHOWN = {
         ),
     },
 }
-"""What some commands of a page print."""
+"""Patterns of the output of some commands, by page."""
 PAGES = ["fiberpools.md", "kubernetes.md", pytest.param("executors.md", marks=pytest.mark.long)]
 NOT_RUN = {
     f". .venv/bin/activate && pip install --quiet --editable '.[kubernetes,{extra}]'": (
@@ -51,7 +51,7 @@ NOT_RUN = {
 
 
 def commands(page: str) -> list[str]:
-    """What a reader types after each prompt, without the comments."""
+    """Return the commands after each prompt, without the comments."""
     blocks = CONSOLE.findall((ROOT / "docs" / page).read_text(encoding="utf-8"))
     return [command for block in blocks for command in COMMAND.findall(block)]
 
@@ -73,7 +73,7 @@ class Shell:
         )
 
     def run(self, command: str) -> str:
-        """What it prints; it must end with status 0."""
+        """Run a command; it must end with status 0. Return its output."""
         assert self._process.stdin is not None
         self._process.stdin.write(f"{{ {command}\n}} </dev/null; echo '{self._END}' $?\n")
         self._process.stdin.flush()
@@ -96,7 +96,9 @@ class Shell:
 
 @pytest.fixture
 def shell(cluster: Cluster, tmp_path: Path) -> Iterator[Shell]:
-    """In the repository, with the Python of these tests, and with what `make cluster` exports."""
+    """Shell in the repository, with these tests' Python and the variables that `make cluster`
+    exports.
+    """
     python = str(Path(sys.executable).parent)
     given = {name: value for name, value in os.environ.items() if not _OURS.match(name)}
     homes = {f"HELM_{kind}_HOME": str(tmp_path) for kind in ("CACHE", "CONFIG", "DATA")}
@@ -104,7 +106,7 @@ def shell(cluster: Cluster, tmp_path: Path) -> Iterator[Shell]:
     try:
         if isinstance(cluster, Own):
             shell.run(CLUSTER)
-        else:  # what a reader has done who has a cluster
+        else:  # a reader who has a cluster has done this
             folders = {str(Path(find_program(program)).parent) for program in ("kubectl", "helm")}
             shell.run(f"export KUBECONFIG={cluster.kubeconfig}")
             shell.run(f"export PATH={os.pathsep.join(folders)}:$PATH")
@@ -116,7 +118,7 @@ def shell(cluster: Cluster, tmp_path: Path) -> Iterator[Shell]:
 
 @pytest.fixture
 def after(bare_cluster: None, release: Release, kube: Kube) -> Iterator[None]:
-    """What the pages install is removed."""
+    """Remove the objects that the pages install."""
     yield
     delete = ("delete", "--ignore-not-found", "--namespace", "default")
     kube.kubectl(*delete, "fiberpool", "minimal")
@@ -126,7 +128,7 @@ def after(bare_cluster: None, release: Release, kube: Kube) -> Iterator[None]:
     kube.delete(path_of("namespaces", name="fiber-system"))
 
 
-@pytest.mark.timeout(600, func_only=True)  # `helm test` has five minutes of its own
+@pytest.mark.timeout(600, func_only=True)  # `helm test` has a limit of five minutes
 @pytest.mark.usefixtures("after")
 @pytest.mark.parametrize("page", PAGES)
 def test_every_command_does_what_its_page_says(page: str, shell: Shell, cluster: Cluster) -> None:

@@ -72,7 +72,7 @@ def test_tasks_that_do_not_end_in_time_run_elsewhere(
 
 
 def test_a_budget_keeps_a_warm_pool_ready(pool: Pool, agent: Body, cluster: Cluster) -> None:
-    """Of two workers on a node, the second goes once there is another on the other node."""
+    """Drain one of two nodes: its worker goes once the other node has a replacement."""
     scene = pool.scene
     *others, node = cluster.workers()
     with cordoned(scene.kube, *others):
@@ -95,7 +95,7 @@ def test_a_killed_test_leaves_no_node_cordoned(cluster: Cluster, kube: Kube) -> 
 
 
 def connected(scene: Scene) -> int:
-    """The workers that are linked to the program, as the status of its pool counts them."""
+    """Return the workers that are linked to the program, by its pool's status."""
     (pool,) = scene.now["fiberpools"].values()
     return int(pool.get("status", {}).get("connectedReplicas") or 0)
 

@@ -23,12 +23,12 @@ RING = ("--members", 3, "--samples", 3000, "--steps", 4)
 
 
 def beginning(pattern: str) -> Callable[[Sequence[str]], list[str]]:
-    """Of each line what begins so."""
+    """Return the rest of each line that begins with this."""
     return lambda lines: [found[0] for line in lines if (found := re.match(pattern, line))]
 
 
 ES_LINES = beginning(r"(generation|  random|  trained).*")
-PI_TO_ONE_PLACE = beginning(r"Pi is roughly 3\.1")  # what is random has no seed there
+PI_TO_ONE_PLACE = beginning(r"Pi is roughly 3\.1")  # random numbers have no seed there
 RETURNS = beginning(r" *[\d,]+ steps .*")
 # A study depends on which trial ends first.
 GRID_AND_STUDY = beginning(r"grid .*gamma=\S+|study of 8 trials: [89]")

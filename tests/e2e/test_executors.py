@@ -42,7 +42,7 @@ def test_libraries_find_what_they_find_alone(
 
 
 def words(lines: list[str]) -> list[str]:
-    """The program's own lines for people.  Fiber's tell of pods that a busy cluster starts late."""
+    """Return the program's own lines. Fiber's lines report pods that a busy cluster starts late."""
     return [line for line in lines if not line.startswith(('{"', "[fiber]"))]
 
 

@@ -79,7 +79,7 @@ def small(
     try:
         yield small
     finally:
-        # The other one would not be ready while nothing but a namespace of this one has a pool.
+        # The other one would not be ready while only a namespace of this one has a pool.
         kube.kubectl("delete", "fiberpools", "--all", "--namespace", scene.namespace)
         small.uninstall()
         release.start()
@@ -104,7 +104,7 @@ def test_one_namespace_is_enough(small: Release, pool: Pool, agent: Body, kube: 
 
 
 def test_the_api_server_takes_all_that_the_chart_renders(release: Release, kube: Kube) -> None:
-    # What is of the Prometheus Operator's kinds is compared with its schema in tests/chart.
+    # tests/chart compares the Prometheus Operator's kinds with their schema.
     everything = {
         "networkPolicy": {"create": True},
         "workerNetworkPolicy": {"create": True, "namespaces": ["default"]},

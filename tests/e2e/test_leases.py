@@ -1,4 +1,4 @@
-"""Masters that vanish without a word: told by their Leases, and what becomes of their pools.
+"""Masters that vanish without notice: their Leases reveal it, and their pools follow.
 
 The pools lose their masters at the same time, since a Lease takes at least five seconds to expire.
 """
@@ -27,7 +27,7 @@ Pools = Mapping[str, Pool]
 
 @pytest.fixture(scope="module")
 def pools(module_scene: Scene, lone_agent: Body) -> Pools:
-    """One for each fate and one whose master comes back, each with a master that is alive."""
+    """Make a pool for each fate, and one whose master comes back; each has a live master."""
     fates = {"delete": "Delete", "shrink": "ScaleToMin", "retain": "Retain", "return": "Delete"}
     pools = {name: Pool(module_scene, name) for name in fates}
     for name, pool in pools.items():
@@ -49,7 +49,7 @@ def master_of(pool: Pool, grace: int) -> Body:
 
 
 def make_lease(pool: Pool) -> None:
-    """What a master does once its pool is there."""
+    """Do what a master does once its pool exists."""
     uid = pool.wait("it is there", lambda: pool.body["metadata"]["uid"] if pool.body else None)
     kind = {"apiVersion": names.API_VERSION, "kind": names.KIND}
     metadata = {
@@ -62,7 +62,7 @@ def make_lease(pool: Pool) -> None:
 
 
 def renew(pool: Pool) -> None:
-    """What a master that is alive does every few seconds."""
+    """Renew as a live master does every few seconds."""
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="microseconds")
     spec = {"renewTime": now.replace("+00:00", "Z")}
     lease = pool.scene.path("leases", names.master_lease_name(pool.name))
@@ -126,7 +126,7 @@ def test_delete_deletes_the_pool(pools: Pools) -> None:
 
 
 def test_a_pool_whose_lease_is_never_made_goes_too(pool: Pool, agent: Body) -> None:
-    """Its program died between making the pool and the Lease."""
+    """Simulate a program that died between making the pool and the Lease."""
     pool.apply(agent, onLost="Delete")
     pool.attach(master=master_of(pool, GRACE))
     pool.has_problem("LeaseNotFound", severity="Warning")

@@ -25,8 +25,9 @@ REVIEWS = "/apis/authentication.k8s.io/v1/tokenreviews"
 
 
 class Token:
-    """One that ends with the Secret that it is bound to: none that may live less than ten minutes
-    can be had.
+    """Token that ends with the Secret that it is bound to.
+
+    Kubernetes grants no token of less than ten minutes.
     """
 
     def __init__(self, scene: Scene, secret: str) -> None:
@@ -57,7 +58,7 @@ def test_a_token_that_is_not_taken(programs: Programs, scene: Scene, tmp_path: P
 def test_a_token_that_ends_is_asked_for_again(
     programs: Programs, scene: Scene, tmp_path: Path
 ) -> None:
-    """By the kubeconfig's plugin, which does not tell when its tokens end."""
+    """Log in by the kubeconfig's plugin, which does not say when its tokens end."""
     said = tmp_path / "credential"
 
     def log_in_with(token: Token) -> None:
@@ -83,7 +84,7 @@ def test_a_token_that_ends_is_asked_for_again(
 def test_a_program_whose_token_ends_for_good_is_told_so(
     programs: Programs, scene: Scene, tmp_path: Path
 ) -> None:
-    """Once it is due to count as gone; the operator then removes what it cannot."""
+    """Programs without a login count as lost later; then the operator removes their pool."""
     token = Token(scene, "login")
     programs.kubeconfig = write_kubeconfig(scene, tmp_path / "config", {"token": token.text})
     program = programs.start("outside", "mapping.py", *ENDLESS)

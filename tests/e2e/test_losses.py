@@ -1,4 +1,4 @@
-"""Pods that go under vector environments, executors and rings: who is told what, and goes on."""
+"""Deaths of pods under vector environments, executors and rings: the errors, and the work after."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def delete(scene: Scene, pod: str) -> None:
 
 
 def sent(program: Program) -> Body:
-    """What it says when two environments are done, and one of two others will never be."""
+    """Return the program's report when two environments are done, and two others are not."""
     said = program.says("sent")
     assert said["steps"] == {"0": 2.0, "1": 2.0}
     assert said["truncated"] == {"0": False, "1": False}

@@ -16,14 +16,14 @@ from e2e.test_apply import SOMEWHERE
 
 @pytest.fixture
 def host(cluster: Cluster) -> str:
-    """Where pods reach a program beside the tests."""
+    """Return the address at which pods reach a program beside the tests."""
     if cluster.outside is None:
         pytest.skip(f"{cluster.description}: pods cannot reach a program beside the tests")
     return cluster.outside
 
 
 def endpoints(scene: Scene, pool: Pool) -> list[tuple[list[str], int]]:
-    """Where the pool's Service leads."""
+    """Return the addresses that the pool's Service leads to."""
     found = scene.now["endpointslices"].get(f"{pool.name}-fiber", {})
     ports = [port["port"] for port in found.get("ports") or []]
     return [
@@ -87,7 +87,7 @@ def test_workers_are_ready_once_a_master_has_answered_them(
     assert (pool.status["replicas"], pool.status["readyReplicas"]) == (1, 0)
     assert pool.status["phase"] == "Scaling"
     assert "connectedReplicas" not in pool.status  # no Lease says anything of it
-    pool.patch(minReplicas=1)  # what the next master does not say of replicas goes
+    pool.patch(minReplicas=1)  # replicas that the next master does not set are removed
     (worker,) = pool.names
     with outside(pool, host) as master:
         master.is_joined_by(worker)
@@ -116,15 +116,15 @@ def test_a_master_in_the_cluster(pool: Pool, agent: Body, image: str) -> None:
 
 
 def test_workers_end_some_time_after_their_master(pool: Pool, agent: Body, host: str) -> None:
-    # Without a Lease nobody but the agents can notice, and those that end make room for new ones.
-    pool.apply(agent, minReplicas=1)  # warm: the worker is older than what the master asks for
+    # Without a Lease only the agents can notice, and those that end make room for new ones.
+    pool.apply(agent, minReplicas=1)  # warm: the worker is older than the master's settings
     (worker,) = pool.ready(1)
     with outside(pool, host, lost_grace=1) as master:
         master.has_welcomed(worker)
     pool.wait("another", lambda: pool.ever - {worker}, seconds=90)
 
     def runs() -> bool:
-        # It is not Ready: it was made for a master of which nobody knows that it is dead.
+        # The pod is not Ready: it was made for a dead master whose death is not known.
         counts = [pool.status.get(f"{kind}Replicas") for kind in ("ready", "pending")]
         return len(pool.live) == 1 and counts == [0, 0]
 

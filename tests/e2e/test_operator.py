@@ -18,7 +18,7 @@ MANY = 12
 
 @pytest.fixture
 def no_operator(release: Release) -> Iterator[None]:
-    """There is no operator; the test may start it, and else it is started at the end."""
+    """Remove the operator; the test may start it, else it is started at the end."""
     release.stop()
     try:
         yield
@@ -152,7 +152,7 @@ def test_what_monitoring_sees(pool: Pool, agent: Body, release: Release) -> None
 
 
 def _is_waiting(release: Release) -> bool:
-    """Whether a second operator runs and says that it does not act."""
+    """Return whether a second operator runs and says that it does not act."""
     pods = release.pods()
     if len(pods) != 2:
         return False

@@ -151,6 +151,6 @@ def ran(program: Program) -> list[int]:
 
 
 def ended_well(pool: Body) -> bool:
-    """Whether no worker of the pool ever failed, or was lost."""
+    """Return whether no worker of the pool ever failed or was lost."""
     failures = pool["status"].get("failures", {})
     return not failures.get("total", 0) and not failures.get("disrupted", 0)

@@ -1,4 +1,4 @@
-"""What goes wrong in the middle of a program: it ends right, or with the right error, in time."""
+"""Faults in the middle of a program: it ends right, or with the right error, in time."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from fiber_api import names
 pytestmark = pytest.mark.timeout(300, func_only=True)
 
 RUNNING = ("--seconds", 0.1)
-"""1,000 tasks on three workers: half a minute, in which a fault can strike."""
+"""Arguments for 1,000 tasks on three workers: half a minute in which a fault can strike."""
 LOST = 30 + 60
 """Seconds after which a program that is gone without a word is lost: its Lease and the grace."""
 SILENCE = 15
-"""Seconds after which a worker that cannot be heard is lost."""
+"""Seconds without messages after which a worker is lost."""
 BRIEF = 8
-"""Seconds of silence that cost nobody anything."""
+"""Seconds of silence that cause no loss."""
 OUTAGE = 60
 """Seconds."""
 
 
 class Site:
-    """Where a fault strikes: the cluster, what is installed on it, and a program that runs."""
+    """Place where a fault strikes: the cluster, its installation, and a running program."""
 
     def __init__(self, cluster: Cluster, release: Release, scene: Scene, program: Program) -> None:
         self.cluster = cluster
@@ -90,7 +90,7 @@ def operator_killed(site: Site) -> Iterator[None]:
 
 @contextmanager
 def api_server_stopped(site: Site) -> Iterator[None]:
-    """For a minute, in which the work goes on."""
+    """Stop the API server for a minute, in which the work goes on."""
     with site.cluster.without_apiserver():
         site.scene.never("it ends", lambda: site.program.status is not None, OUTAGE)
     yield
@@ -116,7 +116,7 @@ def node_back_in_time(site: Site) -> Iterator[None]:
 
 @contextmanager
 def node_back_too_late(site: Site) -> Iterator[None]:
-    """After its workers were lost: what they say then is not counted a second time."""
+    """Reconnect a node after its workers were lost: their late results do not count."""
     with site.cluster.cut_off(site.a_node()):
         site.scene.never("it ends", lambda: site.program.status is not None, SILENCE + 10)
     yield

@@ -1,4 +1,4 @@
-"""What a program cannot have: an error at once that says what to do, and never a silent wait."""
+"""Requests that cannot be met: the program gets an error at once that says what to do."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ REFUSED: dict[str, tuple[Callable[[Scene], None], Body, tuple[str, ...], float]]
     "no right": (role_taken_away, {}, ("fiberpools", "fiber-user"), 10),
     "a namespace that is not there": (nothing_done, {"namespace": "nowhere"}, ("nowhere",), 10),
 }
-"""What is so before the program starts, what it is told, what it says, and within how long."""
+"""State before the program starts, its settings, its output, and its time limit."""
 
 
 @pytest.mark.parametrize("case", REFUSED)

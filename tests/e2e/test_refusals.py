@@ -1,4 +1,4 @@
-"""What the API server refuses: manifests of pools, and pods of pools that looked well."""
+"""Refusals of the API server: manifests of pools, and pods of pools that looked well."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def test_a_template_that_is_no_pod(pool: Pool, agent: Body) -> None:
 
 
 def test_a_misspelt_field_of_the_template_is_named(pool: Pool, agent: Body) -> None:
-    """The schema lets it pass, since what a pod may be depends on the cluster."""
+    """Schemas of pools accept it, because each cluster decides which pods are valid."""
     misspelt = copy.deepcopy(agent)
     misspelt["spec"]["containers"][0]["resorces"] = {"limits": {"memory": "1Gi"}}
     pool.apply(misspelt, minReplicas=1)

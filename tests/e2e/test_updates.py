@@ -11,7 +11,7 @@ from fiber_api import names
 
 
 def newer(agent: Body) -> Body:
-    """The same template but for one variable."""
+    """Return the same template with another value of one variable."""
     changed = copy.deepcopy(agent)
     changed["spec"]["containers"][0]["env"] = [{"name": "VERSION", "value": "2"}]
     return changed

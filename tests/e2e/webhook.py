@@ -50,7 +50,7 @@ def sidecars(scene: Scene, host: str, image: str, folder: Path) -> Iterator[None
 
 
 def _adds(scene: Scene, image: str) -> bool:
-    """Whether a pod of one container would get another."""
+    """Return whether a pod of one container would get another."""
     spec = {"containers": [{"name": "only", "image": image}]}
     pod = {"metadata": {"name": "probe"}, "spec": spec}
     made = scene.kube.create(scene.path("pods"), pod, dryRun="All")
@@ -88,7 +88,7 @@ def _served(host: str, pki: Pki, container: Body) -> Iterator[int]:
             self.wfile.write(body)
 
         def log_message(self, format: str, *args: object) -> None:
-            """Say nothing."""
+            """Log no requests."""
 
     pair = pki.issue("webhook", "webhook", addresses=f"IP:{host}")
     context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)

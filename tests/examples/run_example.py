@@ -1,4 +1,4 @@
-"""Runs an example as its README says: as a script, in a Python of its own."""
+"""Run an example as its README says: as a script, with a separate Python."""
 
 from __future__ import annotations
 

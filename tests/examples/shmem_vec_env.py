@@ -15,12 +15,12 @@ ENVS, STEPS, SHAPE = 3, 30, (4, 84)
 
 
 def observe(index: int, step: int) -> npt.NDArray[np.float32]:
-    """What environment ``index`` sees after ``step`` steps."""
+    """Return the observation of environment ``index`` after ``step`` steps."""
     return np.random.default_rng([index, step]).random(SHAPE, dtype=np.float32)
 
 
 def work(index: int, pipe: Any, buffer: Any) -> None:
-    """Step one environment until told to end."""
+    """Step one environment until the command to end."""
     view = np.frombuffer(buffer.get_obj(), dtype=np.float32).reshape(SHAPE)
     step = 0
     while True:
@@ -49,7 +49,7 @@ class ShmemVecEnv:
             self._processes.append(process)
 
     def ask(self, command: str, action: int = 0) -> npt.NDArray[np.float32]:
-        """Have all do it: what they see."""
+        """Step all environments and return their observations."""
         for pipe in self._pipes:
             pipe.send((command, action))
         for pipe in self._pipes:
@@ -69,7 +69,7 @@ class ShmemVecEnv:
 
 
 def main() -> None:
-    """Compare each observation with what it has to be."""
+    """Compare each observation with the expected one."""
     envs = ShmemVecEnv()
     seen = [envs.ask("reset")] + [envs.ask("step", 1) for _ in range(STEPS)]
     envs.close()

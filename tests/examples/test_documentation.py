@@ -1,4 +1,4 @@
-"""What the documentation shows: its programs run, its links lead somewhere."""
+"""Test the documentation: its programs run, its links lead to existing pages."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def name_of(page: Path) -> str:
 
 
 def programs() -> Iterator[object]:
-    """Every block that is fenced as python: a program of its own (`py` marks what is none)."""
+    """Return every block that is fenced as python: each is a program (`py` marks fragments)."""
     for page in PAGES:
         for number, text in enumerate(FENCED.findall(page.read_text(encoding="utf-8")), 1):
             yield pytest.param(text, id=f"{name_of(page)} {number}")

@@ -20,7 +20,7 @@ SMALL = ("--env", "CartPole-v1", "--generations", 6, "--population", 16, "--seed
 
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
-    """What a single worker prints."""
+    """Return the output of a single worker."""
     return train("local", 1, tmp_path_factory.mktemp("alone") / "curve.png")
 
 
@@ -88,7 +88,7 @@ def test_bar_on_a_terminal(tmp_path: Path) -> None:
 
 
 def read_all(terminal: int) -> str:
-    """What a program writes to its terminal until it ends."""
+    """Return what a program writes to its terminal until it ends."""
     parts: list[bytes] = []
     while True:
         try:

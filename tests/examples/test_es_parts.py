@@ -36,7 +36,7 @@ def test_equal_returns_have_equal_ranks(es: Any) -> None:
 
 
 def test_evolution_climbs(es: Any) -> None:
-    """On a function whose top is known, and with any order of the answers."""
+    """Find the known top of a function, with any order of the answers."""
     rng = np.random.default_rng(0)
     noise = rng.standard_normal(10_000, dtype=np.float32)
     top = np.array([1.0, -2.0, 0.5], dtype=np.float32)
@@ -91,7 +91,7 @@ def test_table_is_read_only(es: Any, temporary: Path) -> None:
 
 
 def test_remove_includes_what_was_left_half_made(es: Any, temporary: Path) -> None:
-    """By a process that was killed while it wrote the table."""
+    """Remove also the file of a process that was killed while it wrote the table."""
     noise = es("noise")
     (temporary / "fiber-es-noise-test-x1y2z3").touch()
     (temporary / "fiber-es-noise-other.f32").touch()

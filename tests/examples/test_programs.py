@@ -1,4 +1,4 @@
-"""Programs as others write them: with Fiber they print what they do with multiprocessing."""
+"""Run programs of other projects: with Fiber they print the same as with multiprocessing."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from examples.run_example import BACKENDS, run
 
 PROGRAMS = Path(__file__).parent / "programs"
 STAND_INS = Path(__file__).parents[1] / "stand_ins"
-"""For torch, where that is not installed."""
+"""Folder of torch's stand-in, for where torch is not installed."""
 
 
 def printed(program: str, module: str, backend: str = "local") -> str:

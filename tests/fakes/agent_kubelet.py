@@ -33,27 +33,27 @@ class AgentKubelet:
     def __init__(self, store: Store) -> None:
         self._store = store
         self._folders: dict[str, Path] = {}
-        """What there is in place of a container's own files, by pod."""
+        """Files in place of a container's own, by pod."""
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self.grace = 4.0
         """Seconds that agents believe they have to end, once their pod is deleted."""
         self.told: set[str] = set()
-        """Pods whose agents have been told to end."""
+        """Pods whose agents got SIGTERM."""
         self.forced: list[str] = []
-        """Pods whose agents did not end when they were told to."""
+        """Pods whose agents did not end after SIGTERM."""
         self.fails_with: tuple[str, str] | None = None
         """Reason and message of a container that cannot start, from now on."""
         self.processes: dict[str, asyncio.subprocess.Process] = {}
-        """By the names of their pods."""
+        """Agents by the names of their pods."""
         self.services: dict[str, str] = {}
-        """By the names of FiberPools, ``host:port`` that all their masters are at."""
+        """Addresses (``host:port``) of all masters of a FiberPool, by its name."""
         self.cut_off = False
         """True if agents started from now on dial an address at which no master is."""
         store.pods_linger = True
         store.created = self._created
 
     def kill(self, pod: str, signum: int = signal.SIGKILL) -> None:
-        """As the kernel does, for want of memory."""
+        """Kill an agent as the kernel does when memory is short."""
         self.processes[pod].send_signal(signum)
 
     async def close(self) -> None:
@@ -128,7 +128,7 @@ class AgentKubelet:
         return process
 
     def _address(self, namespace: str, pool: str) -> str | None:
-        """Where the agents of the pool dial."""
+        """Return the address that the agents of the pool dial."""
         if self.cut_off:
             return "127.0.0.1:1"
         if pool in self.services:
@@ -178,7 +178,7 @@ class AgentKubelet:
         ended: asyncio.Future[int],
         linked: asyncio.Future[None],
     ) -> None:
-        """Tell of the agent's link and of its end, until its pod is deleted."""
+        """Report the agent's link and its end, until its pod is deleted."""
         told = ready = False
         while not self._is_deleted(namespace, name):
             if linked.done() and not (ready or ended.done()):
@@ -203,7 +203,7 @@ class AgentKubelet:
             change.cancel()
 
     def _is_deleted(self, namespace: str, name: str) -> bool:
-        """By somebody, or together with its pool, which may have gone before it was made."""
+        """Return whether the pod was deleted, alone or with its pool."""
         pods = {pod["metadata"]["name"]: pod for pod in self._store.list("pods", namespace)}
         if name not in pods or "deletionTimestamp" in pods[name]["metadata"]:
             return True

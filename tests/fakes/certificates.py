@@ -15,7 +15,7 @@ RUN_VALIDITY = datetime.timedelta(days=365)
 
 @dataclass(frozen=True)
 class Half:
-    """What one side shows to the other: its certificate and the key to it, in PEM."""
+    """Credentials that one side shows to the other: its certificate and its key, in PEM."""
 
     certificate: str = field(repr=False)
     key: str = field(repr=False)

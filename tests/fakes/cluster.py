@@ -47,7 +47,7 @@ class FakeCluster:
         return self.do(take)
 
     def objects(self, plural: str) -> list[Body]:
-        """Those that are there, in all namespaces."""
+        """Return the existing ones in all namespaces."""
         return self.do(self.world.store.list, plural)
 
     def wait(self, condition: Callable[[], object]) -> None:
@@ -58,7 +58,7 @@ class FakeCluster:
 
 @contextlib.contextmanager
 def fake_cluster(**settings: Any) -> Iterator[FakeCluster]:
-    """A new one with nothing in it but an operator, which has these settings."""
+    """Make a new cluster with only an operator, which has these settings."""
     started: concurrent.futures.Future[FakeCluster] = concurrent.futures.Future()
     end = asyncio.Event()
 

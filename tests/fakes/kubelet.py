@@ -1,4 +1,4 @@
-"""What happens to pods on nodes, as the API shows it."""
+"""Events of pods on nodes, as the API shows them."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ BOOKMARK_SECONDS = 60.0
 
 @dataclass(frozen=True)
 class Call:
-    """One request: what RBAC would be asked."""
+    """One request, as RBAC sees it."""
 
     verb: str
     plural: str
@@ -37,7 +37,7 @@ class Call:
 
 @dataclass
 class Fault:
-    """What goes wrong with the next ``times`` calls of this kind, after ``skip`` good ones."""
+    """Fault of the next ``times`` calls of this kind, after ``skip`` good ones."""
 
     verb: str = ""
     plural: str = ""
@@ -47,11 +47,11 @@ class Fault:
     message: str = "this is a test"
     retry_after: float | None = None
     text: str | None = None
-    """This instead of JSON, with status 200 unless ``status`` is set."""
+    """Body instead of JSON, with status 200 unless ``status`` is set."""
     carried_out: bool = False
     """The call is carried out all the same."""
     late: float = 0.0
-    """Seconds before anything happens; with nothing else set, nothing goes wrong then."""
+    """Seconds of delay; with no other field set, the call then succeeds."""
     times: float = 1
     skip: int = 0
     name: str = ""
@@ -79,29 +79,29 @@ class KubernetesApi:
         self.store = store
         self.calls: list[Call] = []
         self.tokens: list[str] = []
-        """Who asked, as far as a client says."""
+        """Tokens of the clients that sent one."""
         self.faults: list[Fault] = []
         self.after: Callable[[Call], None] = lambda call: None
         self.page = 0
-        """How many objects a list has at most though nobody asks for pages; 0: all."""
+        """Largest page of a list, also if the client asks for no pages; 0: unlimited."""
         self.watch_delay = 0.0
         """Seconds between a change and its event."""
         self.largest_answer = 0
         """Bytes of the largest list, or event of a watch, that was sent."""
         self.silent = False
-        """Watches that are open bring nothing any more, not even bookmarks, and do not end."""
+        """True to silence open watches: they bring no events or bookmarks, and do not end."""
         self.down = False
         """Every connection is reset, as with an API server that is gone."""
         self.accepts: set[str] | None = None
         """Values of Authorization that are let in; None: anybody."""
         self.allows: Callable[[Call], bool] = lambda call: True
-        """Whether those who send a token may make such a call; others may make all."""
+        """Decision whether clients that send a token may make such a call; others may make all."""
         self.port = 0
         self.server: Callable[[], asyncio.Protocol]
         """Makes the protocol of a connection, for clients that need no socket."""
         self._watches: set[asyncio.Task[Any]] = set()
         self._applied: dict[Place, Body] = {}
-        """What the one field manager that applies has applied last."""
+        """Bodies that the one applying field manager has applied last."""
 
     @property
     def url(self) -> str:
@@ -308,7 +308,7 @@ def _parse(request: web.Request) -> Call | None:
 
 
 def discovery(path: str) -> Body | None:
-    """What an API server says of itself, or None where the path is about objects."""
+    """Return the API server's description of itself, or None if the path is about objects."""
     groups: dict[str, list[str]] = {}
     for plural, (version, _) in KINDS.items():
         groups.setdefault(version, []).append(plural)

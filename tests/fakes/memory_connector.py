@@ -15,7 +15,7 @@ from fakes.kubernetes_api import KubernetesApi
 
 
 class _End(asyncio.Transport):
-    """One end of a connection: what is written here the other end's protocol receives."""
+    """One end of a connection: the other end's protocol receives the bytes written here."""
 
     def __init__(self, protocol: asyncio.Protocol) -> None:
         super().__init__({"peername": ("127.0.0.1", 1), "sockname": ("127.0.0.1", 2)})
@@ -46,7 +46,7 @@ class _End(asyncio.Transport):
         return not self._closed
 
     def pause_reading(self) -> None:
-        """What was written is in memory already."""
+        """Do nothing: written bytes are in memory already."""
 
     def resume_reading(self) -> None: ...
 

@@ -1,4 +1,4 @@
-"""The API of ``kubernetes_api`` for clients that block: served by a loop on a thread of its own."""
+"""Server of ``kubernetes_api`` for clients that block: its loop runs on a separate thread."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ T = TypeVar("T")
 
 
 class Served:
-    """``api`` and its ``store``; only ``do`` may change what is in the store."""
+    """Served ``api`` and its ``store``; only ``do`` may change the store."""
 
     def __init__(self, api: KubernetesApi, loop: asyncio.AbstractEventLoop) -> None:
         self.api = api
@@ -40,7 +40,7 @@ class Served:
         return done.result(PATIENCE)
 
     def objects(self, plural: str) -> list[Body]:
-        """Those that are there, in all namespaces."""
+        """Return the existing ones in all namespaces."""
         return self.do(self.store.list, plural)
 
 

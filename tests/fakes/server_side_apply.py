@@ -10,7 +10,7 @@ CONTENT_TYPE = "application/apply-patch+yaml"
 
 
 def apply(store: Store, where: Place, before: Body, body: Body) -> Body:
-    """The object as it is then: what was applied ``before`` and is not in ``body`` is removed."""
+    """Apply ``body``, remove the fields that only ``before`` has, and return the object."""
     plural, namespace, name = where
     metadata = body.get("metadata") or {}
     try:
@@ -42,7 +42,7 @@ def _without(current: Any, before: Body, now: Body) -> Body:
 
 
 def _left(current: Any, before: Any) -> Body:
-    """What others have beside what was applied."""
+    """Return the fields of others beside the applied ones."""
     if not isinstance(current, dict) or not isinstance(before, dict):
         return {}
     return {key: value for key, value in current.items() if key not in before}

@@ -1,4 +1,4 @@
-"""What the API server of a cluster holds, as far as the operator can tell the difference.
+"""State of a cluster's API server, as exact as the operator can see.
 
 Resource versions, uids, generations, the status subresource, preconditions, label selectors,
 owner references and a history that watches are served from and that can be forgotten (410).
@@ -62,7 +62,7 @@ class Change(NamedTuple):
 
 
 class Store:
-    """The objects.  What it returns is its own: nobody may change it, and it never does.
+    """Store of objects. Neither the caller nor the store changes an object that it returned.
 
     ``admit`` is asked before a creation and raises Failure to refuse it.
     """
@@ -75,14 +75,14 @@ class Store:
         self._version = 100
         self._addresses = 0
         self.dual_stack = False
-        """Whether Services may have addresses of both IP families."""
+        """Setting: Services may have addresses of both IP families."""
         self._bell = asyncio.Event()
         self.changes: list[Change] = []
         self.oldest = 0
         self.admit: Callable[[str, Body], None] = lambda plural, body: None
         self.created: Callable[[str, Body], None] = lambda plural, body: None
         self.pods_linger = False
-        """Whether a deleted pod stays, terminating, until ``remove``."""
+        """Setting: a deleted pod stays, terminating, until ``remove``."""
         self.collects_garbage = True
 
     def copy(self, clock: Callable[[], float]) -> Store:
@@ -193,10 +193,10 @@ class Store:
             return
         self.remove(plural, namespace, name)
 
-    # -- What the rest of a cluster does
+    # -- The rest of a cluster
 
     def remove(self, plural: str, namespace: str, name: str) -> None:
-        """Take the object away, and what it owns."""
+        """Remove the object and the objects that it owns."""
         body = self._objects.pop((plural, namespace, name))
         self._version += 1
         self._record("DELETED", (plural, namespace, name), self._stamped(body))
@@ -261,7 +261,7 @@ def merged(target: Any, patch: Any) -> Any:
 
 
 def matches(body: Body, selector: str) -> bool:
-    """Whether the labels of ``body`` match: ``a=b``, ``a`` or ``!a``, joined by commas."""
+    """Return whether the labels of ``body`` match: ``a=b``, ``a`` or ``!a``, joined by commas."""
     labels = body["metadata"].get("labels") or {}
     for term in filter(None, selector.split(",")):
         key, equals, value = term.partition("=")
@@ -275,7 +275,7 @@ def matches(body: Body, selector: str) -> bool:
 
 
 def has_fields(body: Body, selector: str) -> bool:
-    """Whether the fields of ``body`` match: ``a.b=c``, joined by commas."""
+    """Return whether the fields of ``body`` match: ``a.b=c``, joined by commas."""
     for term in filter(None, selector.split(",")):
         path, _, value = term.partition("=")
         place: Any = body
@@ -287,5 +287,5 @@ def has_fields(body: Body, selector: str) -> bool:
 
 
 def line(type_: str, body: Body) -> bytes:
-    """One line of a watch."""
+    """Encode one line of a watch."""
     return json.dumps({"type": type_, "object": body}).encode() + b"\n"

@@ -1,4 +1,4 @@
-"""What ``fieldValidation=Strict`` finds in a pod: fields that Kubernetes does not know."""
+"""Check of pods as with ``fieldValidation=Strict``: fields unknown to Kubernetes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from fakes.store import Body, Failure
 
 
 def check(pod: Body) -> None:
-    """Raise what the API server answers."""
+    """Raise the API server's error for an unknown field."""
     unknown = ", ".join(f'unknown field "{path}"' for path in unknown_fields(pod))
     if unknown:
         message = 'Pod in version "v1" cannot be handled as a Pod: strict decoding error: '
@@ -41,7 +41,7 @@ def unknown_fields(value: Any, kind: Any = V1Pod, path: str = "") -> Iterator[st
 
 
 def _within(kind: Any) -> tuple[Any, Any]:
-    """The model that an annotation names, if it names one, and what is in its list, if it is one.
+    """Return the model that an annotation names, if any, and the model of a list's items, if any.
 
     A dictionary is neither: its keys are anybody's.
     """

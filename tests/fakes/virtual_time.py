@@ -20,7 +20,7 @@ from patience import PATIENCE
 T = TypeVar("T")
 
 IN_FLIGHT = 0.001
-"""Seconds within which what was sent arrives, or its confirmation does."""
+"""Seconds within which sent bytes, or their confirmation, arrive."""
 STUCK = PATIENCE
 
 

@@ -39,12 +39,12 @@ def _any_authority() -> str:
 
 
 def configuration(api: KubernetesApi) -> Configuration:
-    """How to reach it."""
+    """Return the address and credentials of the API."""
     return Configuration(host=api.url, ca_cert_data=_any_authority())
 
 
 class Feed:
-    """In kopf's place: tells the program of every change, as watches do."""
+    """Feed in kopf's place: it reports every change to the program, as watches do."""
 
     def __init__(self, world: World, notice: Callable[..., None], **options: Any) -> None:
         self._world = world
@@ -83,7 +83,7 @@ class Feed:
 
 
 class _InMemory(Configuration):
-    """How the operator reaches it without a socket."""
+    """Client configuration of the operator that needs no socket."""
 
     def __init__(self, connector: MemoryConnector) -> None:
         super().__init__(host="http://in.memory", ca_cert_data=_any_authority())
@@ -142,14 +142,14 @@ class World:
         )
 
     async def stop(self) -> None:
-        """As with SIGTERM."""
+        """End as with SIGTERM."""
         assert self._task is not None
         self._stop.set()
         await self._task
         self._task = None
 
     async def kill(self) -> None:
-        """As with SIGKILL: no call after this one."""
+        """End as with SIGKILL: no call after this one."""
         assert self._task is not None
         self._task.cancel()
         await asyncio.wait([self._task])
@@ -317,7 +317,7 @@ Test = Callable[[World], Coroutine[Any, Any, None]]
 
 
 def played(test: Test) -> Callable[[], None]:
-    """The test as pytest calls it: in a world and a time of its own."""
+    """Wrap the test for pytest: it gets a new world and virtual time."""
 
     async def main() -> None:
         async with a_world() as world:

@@ -1,4 +1,4 @@
-"""What the fault tests share: programs under control, and a runtime on either backend."""
+"""Fixtures of the fault tests: programs under control, and a runtime on either backend."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def backend(request: pytest.FixtureRequest) -> Iterator[str]:
     """The runtime of this very process, on each backend in turn."""
     with running(backend=request.param, agents=2) as runtime:
         if request.param == "loopback":
-            # The thread that writes what agents tell lives as long as the runtime.
+            # The thread that writes the agents' output lives as long as the runtime.
             loopback: Any = runtime.backend
             loopback._output.write("test", "begins")
             wait_for(lambda: len(loopback.agents.agents) == len(loopback._slots))

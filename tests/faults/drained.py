@@ -33,14 +33,14 @@ class Site(ABC):
 
     @abstractmethod
     def agents(self) -> list[RemoteAgent]:
-        """Those that are there."""
+        """Return the existing ones."""
 
     @abstractmethod
     def tell(self, host: str) -> None:
-        """Tell the host to end."""
+        """Send SIGTERM to the host."""
 
     def drain(self, host: str) -> RemoteAgent:
-        """Tell a host to end, and wait until the program has heard of that."""
+        """Send SIGTERM to a host, and wait until the program has received its notice."""
         (agent,) = (agent for agent in self.agents() if agent.host == host)
         self.tell(host)
         wait_for(lambda: bool(agent.leaving))
@@ -52,7 +52,7 @@ class Site(ABC):
 
 
 class LoopbackSite(Site):
-    """Two agents; SIGTERM is what an agent hears when its pod is drained."""
+    """Site with two agents; SIGTERM is the signal that a drained pod's agent gets."""
 
     def __init__(self, backend: LoopbackBackend) -> None:
         self._backend = backend
@@ -135,7 +135,7 @@ def grace() -> float:
 
 @pytest.fixture
 def settings() -> dict[str, Any]:
-    """What the program is configured as, besides its backend."""
+    """Return the settings of the program besides its backend."""
     return {}
 
 

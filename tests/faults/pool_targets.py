@@ -81,7 +81,7 @@ def note_and_return(folder: str, number: int) -> int:
 
 
 def note_and_nap(folder: str, number: int) -> int:
-    """As ``note_and_return``, but long enough to be killed in the middle."""
+    """Work as ``note_and_return``, but long enough to be killed in the middle."""
     Path(folder, f"{number}-{time.monotonic_ns()}-{os.getpid()}").touch()
     time.sleep(0.05)
     return number
@@ -159,7 +159,7 @@ def hang_in_python() -> NoReturn:
 
 
 def hang_in_native_code() -> None:
-    """With the GIL, so that no thread and no handler of a signal in Python runs."""
+    """Hold the GIL, so that no thread and no Python signal handler runs."""
     start_beside()
     collections.deque(itertools.repeat(None), maxlen=0)
 

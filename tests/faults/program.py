@@ -1,4 +1,4 @@
-"""A program that uses Fiber, run as a process of its own that a test watches, breaks and counts.
+"""Program that uses Fiber, run as a separate process that a test watches, breaks and counts.
 
 Everything that it starts carries its marker, so that what it left can be found under any adopter;
 its temporary files lie in a folder of its own.
@@ -67,12 +67,12 @@ class Program:
 
     @property
     def stderr(self) -> str:
-        """What it, and all that it started, has written to stderr so far."""
+        """Return what it, and all that it started, has written to stderr so far."""
         return self._stderr.read_text(errors="replace")
 
     @property
     def answer(self) -> str:
-        """What it wrote to the file ``answer`` in its working directory."""
+        """Content of the file ``answer`` in its working directory."""
         return (self.folder / "answer").read_text()
 
     def line(self, seconds: float = PATIENCE) -> str:
@@ -92,7 +92,7 @@ class Program:
         return line.decode()
 
     def rest(self, seconds: float = PATIENCE) -> str:
-        """What is left of its stdout, up to the end."""
+        """Return the rest of its stdout, up to the end."""
         stdout = self.process.stdout
         assert stdout is not None
         deadline = time.monotonic() + seconds
@@ -104,7 +104,7 @@ class Program:
         raise AssertionError(f"its output did not end within {seconds:g} s")
 
     def family(self) -> list[census.Found]:
-        """What it has started and is there still."""
+        """Return the processes that it has started and that still exist."""
         return [
             found for found in census.started_by(self.pid, self._marker) if self._is_ours(found)
         ]
@@ -121,7 +121,7 @@ class Program:
         self.process.wait(PATIENCE)
 
     def wait(self, seconds: float = PATIENCE) -> int:
-        """Its exit status, once it has ended by itself."""
+        """Return its exit status, once it has ended by itself."""
         try:
             return self.process.wait(seconds)
         except subprocess.TimeoutExpired:
@@ -142,7 +142,7 @@ class Program:
         return [*map(str, self.family()), *files]
 
     def finish(self, seconds: float = PATIENCE) -> str:
-        """Wait for a good end that leaves nothing; the rest of its output."""
+        """Wait for a good end without leftovers; return the rest of its output."""
         output = self.rest(seconds)
         status = self.wait(seconds)
         assert status == 0, f"exit status {status}; stderr:\n{self.stderr}"
@@ -165,7 +165,7 @@ def wait_for(condition: Callable[[], bool], seconds: float = PATIENCE, what: str
 
 
 def alive(pid: int) -> bool:
-    """Whether a process runs; a zombie does not."""
+    """Return whether a process runs; a zombie does not."""
     found = census.read(pid)
     return found is not None and found.state != "Z"
 

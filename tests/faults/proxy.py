@@ -9,7 +9,7 @@ from types import TracebackType
 
 
 class Proxy:
-    """Forwards to ``target`` (``host:port``) until cut; runs on a thread of its own.
+    """Proxy that forwards to ``target`` (``host:port``) until cut; it runs on a separate thread.
 
     ``silence``: packets vanish, as with an unplugged cable.  ``sever``: connections break and new
     ones are refused, as with a crashed host.  ``heal`` ends either.
@@ -31,7 +31,7 @@ class Proxy:
         self.break_after: int | None = None
         """Bytes after which all connections break, once; new ones are taken."""
         self.silent_after: int | None = None
-        """Bytes after which nothing gets through until ``heal``."""
+        """Bytes after which no packet gets through until ``heal``."""
         self._selector.register(self._door, selectors.EVENT_READ)
         self._selector.register(self._wake_out, selectors.EVENT_READ)
         self._thread = threading.Thread(target=self._run, name="proxy")
@@ -70,8 +70,10 @@ class Proxy:
             self._hang_up()
 
     def heal(self) -> None:
-        """Let packets through again.  What a silent wire swallowed was not acknowledged: the
-        connections break now, as TCP would have them after its retransmissions.
+        """Let packets through again, over new connections.
+
+        Packets that a silent wire swallowed were not acknowledged. So the old connections break,
+        as TCP's do after its retransmissions.
         """
         with self._lock:
             self._severed = False
@@ -97,7 +99,7 @@ class Proxy:
             return
         try:
             outer = socket.create_connection(self._target)
-        except OSError:  # nobody listens there now
+        except OSError:  # no process listens there now
             inner.close()
             return
         self.connections += 1

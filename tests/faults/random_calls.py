@@ -44,11 +44,11 @@ POOLS: list[dict[str, Any]] = [
 
 
 POLLER = ["anon_inode:[eventfd]", "anon_inode:[eventpoll]"]
-"""What nng's poller has open."""
+"""Descriptors that nng's poller has open."""
 
 
 class Interrupted(BaseException):
-    """What a handler raises."""
+    """Exception that a handler raises."""
 
 
 class Finalized:
@@ -79,7 +79,7 @@ class RandomCalls:
         self._asked: deque[tuple[Any, int]] = deque()
         """Results that handlers and finalizers have asked for, and what each is to be."""
         self._spare: deque[Any] = deque()
-        """What finalizers drop."""
+        """Objects that finalizers drop."""
         self._pool = fiber.Pool(**self._random.choice(POOLS))
         self._other = fiber.Pool(1)
         self._kinds: list[Callable[[], object]] = [
@@ -101,7 +101,7 @@ class RandomCalls:
         ]
         self._rare: list[Callable[[], object]] = [self._second_pool, self._process]
 
-    # What is called.  Each says what it expects, and may be interrupted anywhere.
+    # The calls. Each names the result that it expects, and may be interrupted anywhere.
 
     def _apply(self) -> None:
         n = self._random.randrange(1000)
@@ -281,7 +281,7 @@ class RandomCalls:
             self.failures.append(f"{call.__name__}: {traceback.format_exc()}")
 
     def _keep_calling(self) -> None:
-        """In another thread, where no handler runs: none of its calls may fail."""
+        """Call in another thread, where no handler runs: none of its calls may fail."""
         try:
             while not self._over and not self.failures:
                 assert self._pool.apply(square, (5,)) == 25
@@ -297,7 +297,7 @@ class RandomCalls:
             self.failures.append(f"what was asked in between: {traceback.format_exc()}")
 
     def _lost(self, unraisable: Any) -> None:
-        """An exception that nobody can catch, as in a finalizer."""
+        """Record an exception that cannot be caught, as in a finalizer."""
         if unraisable.exc_type is not Interrupted:
             shown = traceback.format_exception(unraisable.exc_value)
             self.failures.append(f"in {unraisable.object!r}: {''.join(shown)}")
@@ -330,7 +330,7 @@ class RandomCalls:
 
 
 def _within_finalizer(frame: FrameType | None) -> bool:
-    """Whether what is raised would be lost, and with it what a finalizer was about to do."""
+    """Return whether an exception would be lost, and with it the work of a finalizer."""
     while frame is not None:
         if frame.f_code.co_name == "__del__" or frame.f_code is util.Finalize.__call__.__code__:
             return True
@@ -339,7 +339,7 @@ def _within_finalizer(frame: FrameType | None) -> bool:
 
 
 def unfinished(pool: Pool) -> Iterator[Any]:
-    """The jobs of a pool that are not done, but for the one of single calls, if it is idle."""
+    """Return the jobs of a pool that are not done, except an idle job of single calls."""
     for job in list(pool._executor._scheduler.ledger.jobs):
         if job.owner.future is not None or job.done < job.fed:
             yield job
@@ -355,7 +355,7 @@ def descriptors() -> dict[str, str]:
 
 
 def left(before: dict[str, str]) -> list[str]:
-    """Name what is there after the end and was not there before."""
+    """Name the objects that exist after the end and did not exist before."""
     ours = {name: what for name, what in descriptors().items() if before.get(name) != what}
     heap = [name for name, what in ours.items() if what == leaks.HEAP]
     if len(heap) <= leaks.HEAP_LIMIT:  # memory of channels is kept for later ones

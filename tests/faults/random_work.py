@@ -1,4 +1,4 @@
-"""What the workers of ``random_calls`` do: a module that no process runs as its main one."""
+"""Functions of the workers of ``random_calls``: a module that no process runs as its main one."""
 
 from __future__ import annotations
 

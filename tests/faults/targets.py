@@ -271,7 +271,7 @@ def touch_until_it_fails(shared: Any, connection: Any) -> None:
 
 
 def read_as_told(queue: Any, orders: Any) -> None:
-    """Call methods of a queue by name, and send what they return."""
+    """Call methods of a queue by name, and send their results."""
     while True:
         orders.send(getattr(queue, orders.recv())())
 
@@ -314,7 +314,7 @@ def echo_large(connection: Any, requests: Any, replies: Any) -> None:
 
 
 def exchange_large(connection: Any, requests: Any, replies: Any) -> None:
-    """Take large messages, and send each back once told to."""
+    """Take large messages, and send each back when asked."""
     for receive, send in ((connection.recv, connection.send), (requests.get, replies.put)):
         data = receive()
         connection.send(checksum(data))

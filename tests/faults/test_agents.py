@@ -115,7 +115,7 @@ def test_one_that_is_stopped_for_a_moment_loses_nothing(backend: LoopbackBackend
     for number in range(3):
         stop_and_wait(agent_pid)
         ours.send(number)
-        time.sleep(0.1)  # the length of the stop, which is what is tested
+        time.sleep(0.1)  # the length of the stop, which is tested
         os.kill(agent_pid, signal.SIGCONT)
         assert ours.recv() == number
     assert child.is_alive()

@@ -1,4 +1,4 @@
-"""What a person can get wrong is answered at once, with what is wrong and what to do."""
+"""Mistakes of a person are answered at once, with the mistake and the remedy."""
 
 from __future__ import annotations
 

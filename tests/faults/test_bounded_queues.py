@@ -20,7 +20,7 @@ SIZE = 8
 
 
 def room(queue: Any) -> int:
-    """How many items an empty queue takes."""
+    """Return how many items an empty queue takes."""
     for count in range(SIZE + 1):
         try:
             queue.put(count, timeout=PATIENCE if count < SIZE else 0)
@@ -30,7 +30,7 @@ def room(queue: Any) -> int:
 
 
 def room_left_by_one(queue: Any) -> int:
-    """How many places are free while an empty queue has one item."""
+    """Return how many places are free while an empty queue has one item."""
     queue.put("one")
     free: int = queue._slots._free.value()
     assert queue.get() == "one"

@@ -1,4 +1,4 @@
-"""Children that end in every way and at every stage: their end is told, exactly, and at once."""
+"""Kill children in every way and at every stage: their end is reported, exactly, and at once."""
 
 from __future__ import annotations
 

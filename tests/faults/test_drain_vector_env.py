@@ -33,13 +33,13 @@ REASON = "(Drained|Deleted): "
 
 @pytest.fixture
 def gate(tmp_path: Path) -> Path:
-    """What ``WAIT`` waits for."""
+    """File that ``WAIT`` waits for."""
     return tmp_path / "gate"
 
 
 @pytest.fixture
 def env(site: Site, gate: Path) -> Iterator[VectorEnv]:
-    """Four environments in two workers, each on a host of its own, after a step."""
+    """Make four environments in two workers, each on a separate host, after a step."""
     env = VectorEnv([partial(Faulty, gate)] * 4, num_workers=2)
     try:
         env.reset()
@@ -81,7 +81,7 @@ def test_a_worker_answers_the_step_that_it_is_at_and_moves(
     assert rewards.tolist() == [1, 1, 0, 0]
     assert truncations.tolist() == [False, False, True, True]
     assert "is about to go: " in infos["restarted"][2]
-    wait_for(lambda: agent.lost is not None)  # nothing runs there: it need not wait for the grace
+    wait_for(lambda: agent.lost is not None)  # the host is idle: it need not wait for the grace
     works(env)
 
 

@@ -1,4 +1,4 @@
-"""An exception of a user arrives as what it is, by every way, on each backend."""
+"""Raise exceptions of users in each way, on each backend: they arrive unchanged."""
 
 from __future__ import annotations
 

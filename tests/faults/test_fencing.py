@@ -69,7 +69,7 @@ class Warm:
         self.cluster = cluster
         self.service = service
         self.way = way
-        """How the first master reaches the API server."""
+        """Proxy between the first master and the API server."""
         (self.pod,) = pods_of(cluster)
 
     def lead_to_master(self, epoch: int) -> None:

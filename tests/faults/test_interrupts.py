@@ -214,6 +214,6 @@ def _read_all(terminal: int) -> str:
     try:
         while data := os.read(terminal, 4096):
             shown += data
-    except OSError:  # how a terminal says that nobody writes to it any more
+    except OSError:  # a terminal reports in this way that its writer is gone
         pass
     return shown.decode()

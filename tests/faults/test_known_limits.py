@@ -1,4 +1,4 @@
-"""What a hostile task can do: the rows of docs/security.md that say "does not hold" or "works".
+"""Hostile tasks: the rows of docs/security.md that say "does not hold" or "works".
 
 A test that fails here may be good news: then the row is to be rewritten.
 """

@@ -122,7 +122,7 @@ def resident(pid: int, what: str) -> int:
 
 
 def forget_peak(pid: int) -> int:
-    """Have the system count a process's most memory anew; return what it has now."""
+    """Have the system count a process's peak memory anew; return its current memory."""
     Path(f"/proc/{pid}/clear_refs").write_text("5")
     return resident(pid, "VmRSS")
 

@@ -1,4 +1,4 @@
-"""The network between master and agents: short cuts cost nothing, long ones only time."""
+"""Cut the network between master and agents: short cuts cost nothing, long ones only time."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from faults.wire import Wire
 from patience import PATIENCE
 
 SHORT = 0.5
-"""Seconds of a cut that must cost nothing."""
+"""Seconds of a cut that must cause no loss."""
 
 
 @pytest.mark.parametrize("way", ["silence", "sever"])
@@ -28,7 +28,7 @@ def test_a_short_cut_loses_nothing(wire: Wire, way: str) -> None:
         ours.send(number)
         if number == 25:
             getattr(wire.proxy, way)()
-    time.sleep(SHORT)  # the length of the cut, which is what is tested
+    time.sleep(SHORT)  # the length of the cut, which is tested
     wire.proxy.heal()
     assert [ours.recv() for _ in range(50)] == list(range(1, 51))
     assert child.is_alive()

@@ -31,7 +31,7 @@ def soon() -> Iterator[Callable[..., None]]:
     yield call
     for timer in timers:
         timer.join()
-    timers.clear()  # they hold what they called
+    timers.clear()  # they keep the callee alive
 
 
 def works(pool: Any) -> bool:

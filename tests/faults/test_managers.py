@@ -33,7 +33,7 @@ def manager() -> Iterator[Any]:
 
 @pytest.fixture
 def victim(manager: Any) -> Iterator[Any]:
-    """A process that does as it is told, to be killed."""
+    """Yield a process that obeys commands, to be killed."""
     orders = manager.Queue()
     process = fiber.Process(target=targets.obey, args=(orders,))
     process.start()
@@ -183,7 +183,7 @@ def test_a_dead_waiter_gets_no_lock(manager: Any, victim: Any, kind: str) -> Non
     victim("die")
     lock.release()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # whether it had it for a moment, nobody can know
+        warnings.simplefilter("ignore")  # the process may have had the lock for a moment
         assert lock.acquire(True, PATIENCE)
 
 

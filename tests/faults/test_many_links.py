@@ -52,7 +52,7 @@ AGENTS = """
 
 
 class Master:
-    """Takes every agent, and counts what they say."""
+    """Master that accepts every agent and counts its messages."""
 
     def __init__(self, credentials: MasterCredentials) -> None:
         self.links: list[Link] = []

@@ -1,4 +1,4 @@
-"""The program is killed, however: within two seconds nothing of it is left."""
+"""Deaths of the program: within two seconds all its processes are gone."""
 
 from __future__ import annotations
 
@@ -193,7 +193,7 @@ def test_killed_together_with_its_zygotes_it_leaves_no_process(
     for pid in zygotes:
         os.kill(pid, signal.SIGKILL)
     program.kill()
-    # Nobody is left who could remove its directory.
+    # No process is left that could remove its directory.
     wait_for(lambda: not program.family())
     for directory in program.temporary.iterdir():
         shutil.rmtree(directory)

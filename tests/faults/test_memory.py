@@ -1,4 +1,4 @@
-"""Out of memory: who has no room for a message hears of it, and the program goes on."""
+"""Shortage of memory: a process without room for a message gets an error; the program goes on."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ def read(secret: Any, seen: Any) -> None:
 
 
 def break_in(mine: Any) -> tuple[int, list[bytes]]:
-    """Try to use what this process was not handed; how often it was refused, and what it found."""
+    """Try to use objects that this process was not given; return the refusals and the finds."""
     home, token = mine._inbox.home, mine._inbox.token
     mine._inbox.confirm()
     numbers = [number.to_bytes(16, order) for number in range(64) for order in ("little", "big")]

@@ -1,4 +1,4 @@
-"""What children write, and what happens when nobody can take it."""
+"""Output of children, and the case that it cannot be written."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""When pods are Ready, on a cluster played in this process, and how many are connected."""
+"""Pods' readiness on a simulated cluster in this process, and the number of connected pods."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_pods_are_ready_once_their_agents_are_linked(
         cluster.wait(has(readyReplicas=2, connectedReplicas=2))
         pods = {pod["metadata"]["name"]: pod for pod in cluster.objects("pods")}
         assert all("startupProbe" in pod["spec"]["containers"][0] for pod in pods.values())
-        # One that dials where nobody is takes the place of one that is killed.
+        # A worker that dials a dead address replaces one that is killed.
         cluster.nodes.cut_off = True
         cluster.do(cluster.nodes.kill, next(iter(pods)))
         cluster.wait(has(replicas=2, pendingReplicas=0, readyReplicas=1, connectedReplicas=1))

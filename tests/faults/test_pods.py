@@ -469,7 +469,7 @@ def test_the_end_of_a_pipe_says_what_became_of_the_pod(cluster: FakeCluster) -> 
         with pytest.raises(EOFError, match=f"Deleted: somebody deleted the pod, in pod {victim}"):
             ours.recv()
         child.join(PATIENCE)
-        assert child.exitcode == -signal.SIGKILL  # once the grace of its pod was over
+        assert child.exitcode == -signal.SIGKILL  # after the grace of its pod
         ours.close()
 
 

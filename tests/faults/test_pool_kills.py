@@ -35,7 +35,7 @@ def kill(pid: int) -> None:
 
 
 def kill_one(pool: Pool, choose: Callable[[list[int]], int] = random.choice) -> None:
-    """Kill any of its workers, unless all were killed and none has come in their place yet."""
+    """Kill any of its workers, unless all were killed and no replacement has come yet."""
     if living := pids(pool):
         kill(choose(living))
 
@@ -166,7 +166,7 @@ def test_a_stopped_worker_holds_up_only_its_own_task(tmp_path: Path) -> None:
         works(pool)
         stopped, *_ = pids(pool)
         stop_and_wait(stopped)
-        # What the other can run it runs, the stopped one has at most one task of each call.
+        # The other worker runs all that it can; the stopped one has at most one task of each call.
         results = [pool.apply_async(abs, (-n,)) for n in range(50)]
         wait_for(lambda: sum(result.ready() for result in results) >= 45)
         os.kill(stopped, signal.SIGCONT)

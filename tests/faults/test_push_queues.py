@@ -1,4 +1,4 @@
-"""SimpleQueuePush: items are dealt round robin, to those who live."""
+"""SimpleQueuePush deals items round robin, to live readers."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.usefixtures("backend")
 
 
 class Reader:
-    """A process that reads when it is told to."""
+    """Process that reads when asked."""
 
     def __init__(self, queue: SimpleQueuePush[Any]) -> None:
         self._orders, theirs = fiber.Pipe()

@@ -1,4 +1,4 @@
-"""Shared memory when those who have it die, on one host and between hosts."""
+"""Shared memory when its processes die, on one host and between hosts."""
 
 from __future__ import annotations
 

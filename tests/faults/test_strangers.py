@@ -1,4 +1,4 @@
-"""Strangers at the doors: they can stop nothing, read nothing and run nothing."""
+"""Strangers at the sockets: they can stop nothing, read nothing and run nothing."""
 
 from __future__ import annotations
 
@@ -166,7 +166,7 @@ def test_a_stranger_who_claims_to_be_an_agent_is_not_believed(backend: LoopbackB
     works()
 
 
-# The door of the hub, a unix socket in a private directory
+# The hub's socket, a unix socket in a private directory
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Directories that are missing, full or forbidden, and what a program needs of them."""
+"""Directories that are missing, full or forbidden, and the program's needs of them."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def folder() -> Iterator[Path]:
 
 
 def test_no_temporary_directory_at_all(launch_on: Callable[..., Program]) -> None:
-    """Python itself falls back to others; where TMPDIR does not exist nothing is lost."""
+    """Python falls back to other directories; where TMPDIR does not exist no file is lost."""
     program = launch_on(WORK, env={"TMPDIR": "/no/such/directory"})
     assert program.finish() == "1\n[1, 2]\n"
 
@@ -179,7 +179,7 @@ FIRST_PROCESS = """
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may make a process namespace")
 def test_process_1_of_a_container_leaves_no_zombies(tmp_path: Path) -> None:
-    """As in a pod, where nobody else reaps what children leave behind."""
+    """Run as in a pod, where no other process reaps orphans."""
     script = tmp_path / "program.py"
     script.write_text(textwrap.dedent(FIRST_PROCESS))
     done = subprocess.run(

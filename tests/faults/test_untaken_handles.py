@@ -27,7 +27,7 @@ UNTAKEN = """
 def test_a_handle_that_nobody_took_holds_its_end_as_long_as_multiprocessings(
     launch_on: Callable[..., Program], library: str
 ) -> None:
-    """Nobody hears that the kernel threw a message away together with its pipe.
+    """Kernels throw a message away together with its pipe, and notify no process.
 
     So a process that has sent an end keeps it for a later taker, until the program ends.
     """

@@ -1,4 +1,4 @@
-"""Environments that raise, hang or kill their worker: told by number, and replaced if asked."""
+"""Environments that raise, hang or kill their worker: named by number, and replaced if asked."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def vector_env(backend: str) -> Iterator[Make]:
 
 
 def works(env: VectorEnv) -> None:
-    """All environments can be reset and stepped, and are what they were made as."""
+    """Check that all environments can be reset and stepped, and are as they were made."""
     assert env.reset()[0].tolist() == [[0]] * 4
     assert env.step([GOOD] * 4)[0].tolist() == [[1]] * 4
 

@@ -146,7 +146,7 @@ raise ImportError(__name__)
 def test_modules_that_a_task_wrote_do_not_run_in_the_next_life(
     pool: Pool, tmp_path: Path, module: str
 ) -> None:
-    """In the working directory, which Python searches first, and on PYTHONPATH."""
+    """Write into the working directory, which Python searches first, and on PYTHONPATH."""
     before = "import sys; sys.path.insert(0, '')\n"
     path = os.pathsep.join([str(tmp_path), *filter(None, sys.path)])
     agent = pool.agent(30, before + textwrap.dedent(AGENT), PYTHONPATH=path)
@@ -234,7 +234,7 @@ def test_it_ends_when_no_master_comes_after_a_lost_one(pool: Pool) -> None:
 
 
 def test_a_master_says_how_long_it_is_waited_for(pool: Pool) -> None:
-    """The agent is older than what this master asks of its pool."""
+    """Settings of the master are newer than the agent."""
     agent = pool.agent(grace=600)
     master = pool.master("0.5")
     assert master.line() == "joined warm-0"

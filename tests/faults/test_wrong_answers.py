@@ -38,7 +38,7 @@ def _words(lie: str, own: int) -> Any:
 
 
 def attack(lie: str, begun: Path) -> None:
-    """Lie in the name of this worker, and wait for what becomes of it."""
+    """Send a wrong answer in the name of this worker, and wait for the result."""
     while not begun.exists():
         threading.Event().wait(0.01)
     channel = child.task_channel()

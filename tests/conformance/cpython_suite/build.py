@@ -38,7 +38,7 @@ _SUPPORT = (
 
 
 class Case(NamedTuple):
-    """One of CPython's tests."""
+    """Test case of CPython."""
 
     class_name: str  # as CPython reports it: WithProcessesTestQueue
     base_name: str  # as it is written in the source: TestQueue

@@ -21,7 +21,9 @@ TIERS = frozenset(os.environ.get("MP_TIERS", "core,local").split(","))
 
 
 def stand_in(name: str) -> types.ModuleType:
-    """What a pickled reference to ``multiprocessing[.x]`` becomes in the process that loads it."""
+    """Return what a pickled reference to ``multiprocessing[.x]`` becomes in the process that loads
+    it.
+    """
     return _redirection.stand_in(name)
 
 

@@ -57,7 +57,7 @@ def redirect(module: types.ModuleType) -> None:
 
 
 def redirected(script: str) -> str:
-    """What another interpreter runs."""
+    """Return the source that another interpreter runs."""
     for name in ("concurrent.futures", "multiprocessing"):
         script = script.replace(f"from {name} import", "from fiber import")
     return script

@@ -75,7 +75,7 @@ class _Package(types.ModuleType):
 
 
 class Redirection:
-    """Everything that one test module must be told about the module under test."""
+    """Settings that one test module needs about the module under test."""
 
     def __init__(self, module_name: str, by_name: Callable[[str], types.ModuleType]) -> None:
         """`by_name` is importable in children: it finds the same stand-in there."""
@@ -95,7 +95,7 @@ class Redirection:
         fromlist: Any = (),
         level: int = 0,
     ) -> types.ModuleType:
-        """What the test module has as ``__import__``."""
+        """Import for the test module, in place of ``__import__``."""
         if level or name.partition(".")[0] != STANDARD:
             return builtins.__import__(name, globals, locals, fromlist, level)
         stand_in = self.stand_in(name)
@@ -107,7 +107,7 @@ class Redirection:
         return self._submodule(submodule) if submodule else self.package
 
     def package_attribute(self, attribute: str) -> Any:
-        """What ``multiprocessing.<attribute>`` is for the test module."""
+        """Return ``multiprocessing.<attribute>`` as the test module sees it."""
         name = self.module.__name__
         try:
             value = getattr(self.module, attribute)

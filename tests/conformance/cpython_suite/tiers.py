@@ -1,4 +1,4 @@
-"""Which of CPython's tests say what about a distributed drop-in.
+"""Tiers of CPython's tests: which of them matter for a distributed drop-in.
 
 A test belongs to the first table that names it, as ``Class.test``, ``Class.test[type]`` (type is
 processes or manager) or ``Class.*``; ``Class`` is CPython's base name without the leading
@@ -157,7 +157,7 @@ def tier_of(class_name: str, method: str, type_: str | None = None) -> Tier:
 
 
 def reason_of(class_name: str, method: str, type_: str | None = None) -> str:
-    """Why a test is in its tier; empty for what is part of every run."""
+    """Return why a test is in its tier; empty if it is part of every run."""
     return _find(class_name, method, type_)[1]
 
 

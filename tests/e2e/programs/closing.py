@@ -1,4 +1,4 @@
-"""A program whose tasks see what they reach, while somebody closes the network around them.
+"""Program whose tasks report which addresses they reach, while the test closes the network.
 
 The arguments are targets, as ``HOST:PORT``.  It says ``open`` with those that a task reaches,
 ``closed`` once a task reaches none of them, and ``done`` once a worker works that came after that.

@@ -69,7 +69,9 @@ def make() -> Steps:
 
 
 def main() -> None:
-    """As the arguments say; status 0 also where some are lost: that is what is looked at."""
+    """Run with the environments of the arguments; exit with 0 also if some are lost, as tests
+    expect.
+    """
     options = _parse()
     envs = VectorEnv(
         [make] * ENVS, num_workers=WORKERS, on_error=options.on_error, timeout=options.timeout
@@ -95,7 +97,7 @@ def main() -> None:
 def facts(
     observations: Any, rewards: Any, terminations: Any, truncations: Any, infos: dict[str, Any]
 ) -> dict[str, Any]:
-    """What was received, by the number of the environment."""
+    """Return the received values by the number of the environment."""
     numbers = infos["env_id"].tolist()
     restarted = infos.get("restarted", [None] * len(numbers))
     columns = {

@@ -1,4 +1,4 @@
-"""What a ``fiber.Executor`` can do, a line for each, the same wherever its workers are.
+"""Each feature of a ``fiber.Executor`` on one line, the same wherever its workers are.
 
 With ``--lose`` a task waits for its pod to be deleted, and runs again as often as ``--retries``
 says: the program then says in JSON what came of it, ``done`` or ``lost``, and ``goes on``.
@@ -52,7 +52,7 @@ def wait_once() -> int:
 
 
 def read(counted: list[int]) -> Iterator[int]:
-    """Numbers without end; how many were read is told by the list."""
+    """Yield numbers without end; the list records how many were read."""
     while True:
         counted.append(len(counted))
         yield counted[-1]
@@ -66,7 +66,7 @@ async def gathered(executor: fiber.Executor) -> list[int]:
 
 
 def show(executor: fiber.Executor) -> None:
-    """Each part of its interface."""
+    """Use each part of its interface."""
     futures = [executor.submit(square, number) for number in range(50)]
     print("submit:", sum(future.result() for future in as_completed(futures)))
     print("map:", *executor.map(square, range(10), chunksize=3))
@@ -103,7 +103,7 @@ def lose(executor: fiber.Executor, retries: int) -> None:
 
 
 def main() -> None:
-    """As the arguments say."""
+    """Run with the arguments' settings."""
     options = _parse()
     started = fiber.Value("i", 0)
     with fiber.Executor(2, initializer=begin, initargs=(started,)) as executor:

@@ -1,4 +1,4 @@
-"""One process that asks for a GPU, and says where it runs."""
+"""Program with one process that asks for a GPU and prints where it runs."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ TASKS: dict[str, Callable[[float, int], tuple[int, str]]] = {
 
 
 def main() -> None:
-    """As the arguments say; the results must be those of the built-in map."""
+    """Run with the arguments' settings and compare the results with the built-in map's."""
     options = _parse()
     fiber.init(retries=options.retries)
     task = partial(TASKS[options.task], options.seconds)
@@ -80,7 +80,7 @@ def main() -> None:
 
 
 def pool_for(options: argparse.Namespace) -> Any:
-    """As many workers as were asked for, or as many as the work asks for."""
+    """Return a pool of the requested number of workers, or of as many as the work needs."""
     if options.most:
         return fiber.Pool(min_workers=0, max_workers=options.most, idle_timeout=1)
     return fiber.Pool(options.workers, disruptions=options.disruptions)

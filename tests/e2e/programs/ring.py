@@ -14,7 +14,7 @@ from fiber.errors import MemberLost
 
 
 def go_round(rank: int, size: int) -> None:
-    """Until it is told of a loss, which it prints and passes on."""
+    """Exchange numbers until a member is lost; print the loss and pass it on."""
     member = fiber.ring.current()
     print(f"member {rank} is in {socket.gethostname()}.", flush=True)
     try:

@@ -28,7 +28,7 @@ def height(x: float, y: float) -> float:
 
 
 def grid() -> GridSearchCV:
-    """By joblib, which is told by nobody here where it has its work done."""
+    """Search by joblib, without a hint about where the work is done."""
     images, digits = (each[:200] for each in load_digits(return_X_y=True))
     search = GridSearchCV(SVC(), {"C": [0.01, 1.0, 100.0], "gamma": [1e-4, 1e-3]}, cv=3)
     return search.fit(images, digits)
@@ -43,7 +43,7 @@ def evolved(workers: Any) -> tuple[list[float], int]:
 
 
 def studied(executor: fiber.Executor | None) -> list[float]:
-    """The values of Optuna's trials, of which some run at a time and all are told in order."""
+    """Return the values of Optuna's trials, some of which run at a time, all in order."""
     sampler = optuna.samplers.TPESampler(seed=0, constant_liar=True)
     study = optuna.create_study(sampler=sampler)
     for _ in range(TRIALS // AT_A_TIME):

@@ -16,7 +16,7 @@ def large(number: int) -> int:
 
 
 def main() -> None:
-    """Both must give what they give anywhere."""
+    """Map over pools of two shapes, and check the results."""
     with fiber.Pool(2) as few, fiber.Pool(2) as many:
         results = [few.map_async(small, range(20)), many.map_async(large, range(20))]
         assert [result.get() for result in results] == [[*range(1, 21)], [*range(2, 22)]]

@@ -78,11 +78,11 @@ def _forms(key: str) -> Iterator[tuple[str, bytes]]:
     yield "base64", base64.b64encode(raw)
 
 
-# -- What a task does
+# -- The tasks
 
 
 def spy(disguised: Mapping[str, bytes]) -> dict[str, object]:
-    """Return what is found where, and which processes let this one read what."""
+    """Return which secrets are found where, and which processes' memory this one can read."""
     canary = disguised[f"{CANARY}, hexadecimal"].translate(DISGUISE)
     found: dict[str, list[str]] = {}
     opened = []

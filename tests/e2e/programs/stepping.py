@@ -16,7 +16,7 @@ import fiber
 
 
 def count(connection: Any, mine: Any) -> None:
-    """The child: adds what it gets, until the other end goes."""
+    """Add the received numbers in the child, until the other end goes."""
     mine.close()  # or this copy would keep the pipe open
     connection.send(socket.gethostname())
     total = 0
@@ -29,7 +29,7 @@ def count(connection: Any, mine: Any) -> None:
 
 
 def main() -> None:
-    """As the arguments say; status 0 also where a process is lost: that is what is looked at."""
+    """Run with the arguments' settings; exit with 0 also if a process is lost, as tests expect."""
     options = _parse()
     pipes, processes = [], []
     for _ in range(options.envs):
@@ -59,11 +59,11 @@ def main() -> None:
 
 
 def send(pipe: Any, number: int) -> None:
-    """Send it; EOFError where nobody is there any more, which says why."""
+    """Send a number; raise EOFError with the reason if the other process is gone."""
     try:
         pipe.send(number)
     except BrokenPipeError:
-        while True:  # what was sent before the end, and then that
+        while True:  # messages that were sent before the end arrive first
             pipe.recv()
 
 

@@ -1,5 +1,6 @@
-"""As POET uses a manager and a pool: managed dicts in the arguments of the pool's initializer, and
-in each worker caches of what they hold, keyed by the iteration.
+"""Program that uses a manager and a pool as POET does.
+
+The initializer's arguments have managed dicts. Each worker caches their values by iteration.
 
     poet.py multiprocessing|fiber
 """

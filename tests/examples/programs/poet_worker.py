@@ -1,4 +1,4 @@
-"""What a worker of poet.py does."""
+"""Functions of poet.py's workers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def initialize_worker(shared_thetas: Any, shared_niches: Any) -> None:
 
 
 def theta_of(iteration: int, niche: int) -> list[float]:
-    """Fetched once for each iteration, of which it keeps the last."""
+    """Fetch the value once for each iteration; keep the last one."""
     global cached_iteration
     if iteration != cached_iteration:
         cached_iteration = iteration

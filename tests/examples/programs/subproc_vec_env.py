@@ -37,7 +37,7 @@ class CloudpickleWrapper:
 
 @contextlib.contextmanager
 def without_mpi_variables() -> Iterator[None]:
-    """An MPI that finds these in a child thinks that it is one of its own."""
+    """Hide the variables that make an MPI in a child think that mpirun started it."""
     removed = {name: os.environ.pop(name) for name in list(os.environ) if name.startswith("PMI_")}
     try:
         yield
