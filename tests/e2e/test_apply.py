@@ -187,9 +187,7 @@ def test_an_evicted_worker_is_replaced(pool: Pool, agent: Body) -> None:
 
 def test_kubectl_explains_the_fields(release: Release, kube: Kube) -> None:
     assert says(kube.kubectl("explain", "fiberpool"), "pool of worker pods", "spec", "status")
-    assert "Action when the master is lost" in kube.kubectl(
-        "explain", "fiberpool.spec.onLost"
-    )
+    assert "Action when the master is lost" in kube.kubectl("explain", "fiberpool.spec.onLost")
 
 
 def test_two_pools_do_not_mix(scene: Scene, agent: Body) -> None:
