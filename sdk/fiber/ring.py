@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any, Generic, NamedTuple, NoReturn, TypeVar
 
-from fiber._agent.travelling import Travelling
+from fiber._agent.exception_pickles import PickledException
 from fiber._exceptions import add_note, fresh
 from fiber._runtime import options
 from fiber.connection import Connection, Pipe, wait
@@ -235,4 +235,4 @@ def _run(
         member._news.send((func(member.rank, member.size), None))
     except Exception as error:  # also of a result that does not pickle
         with contextlib.suppress(BrokenPipeError, ConnectionClosed):  # the program is gone
-            member._news.send((None, Travelling(error)))
+            member._news.send((None, PickledException(error)))

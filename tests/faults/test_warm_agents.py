@@ -168,7 +168,7 @@ from fiber._agent import main, zygote_process
 show = "print(sys.flags.isolated, *zygote_process.interpreter_arguments('python', '')[:-2])"
 exec(show)
 sys.stdout.flush()
-*command, statement = main._next_life()
+*command, statement = main._restart_command()
 subprocess.run([*command, statement.partition("import runpy")[0] + show], check=True)
 """
     command = [sys.executable, "-O", "-c", program]

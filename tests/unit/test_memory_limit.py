@@ -44,7 +44,7 @@ def test_each_kill_is_told_once(group: Path) -> None:
         ("167772160\n", "its memory limit is 160Mi"),
         ("2147483648\n", "its memory limit is 2Gi"),
         ("1001\n", "its memory limit is 1001 bytes"),
-        ("max\n", "no limit of its own"),
+        ("max\n", "its container has no memory limit"),
     ],
 )
 def test_the_limit_is_written_as_kubernetes_does(group: Path, maximum: str, words: str) -> None:
@@ -68,7 +68,7 @@ def test_the_first_version_of_control_groups_counts_too(tmp_path: Path) -> None:
 def test_where_nothing_is_counted_nobody_is_blamed(tmp_path: Path) -> None:
     limit = MemoryLimit(str(tmp_path), str(tmp_path / "nothing"))
     assert not limit.was_exceeded()
-    assert limit.describe() == "no limit of its own"
+    assert limit.describe() == "its container has no memory limit"
 
 
 def test_a_child_that_was_killed_for_it_says_so(group: Path, loop: Any) -> None:

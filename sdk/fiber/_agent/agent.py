@@ -39,14 +39,14 @@ from fiber._wire.memory_files import Blob, BytesLike
 from fiber._wire.packet import Message
 from fiber.errors import TooManyOpenFiles
 
-_ENDING = "this process is ending: no process can be started any more"
+_ENDING = "this process is ending, so it starts no process"
 
 _CLOSE_TIMEOUT = 10.0
 """Seconds that the loop may take to run the calls that were queued before the close."""
 
 
 class Agent:
-    """Agent of this host, which runs its children."""
+    """Agent of this host, which runs the host's children."""
 
     def __init__(self, loop: Loop, host: str, hub: Hub | None = None) -> None:
         self.host = host
@@ -302,7 +302,7 @@ class LocalChild:
         self._ours: socket.socket | None = None
         self._theirs: socket.socket | None = None
         self._outbox: Outbox | None = None
-        self._lent = False
+        self._in_direct_use = False
 
     def start(self) -> None:
         """Start the child.  Calls that follow in the same turn of the loop find it registered."""
@@ -416,13 +416,13 @@ class LocalChild:
         except OSError:
             return None
         self._loop.pause(self._ours.fileno())
-        self._lent = True
+        self._in_direct_use = True
         sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET, fileno=fd)
         return LocalTaskChannel(sock, self.abort)
 
     def reclaim(self) -> None:
         """Receive the child's packets again, after ``lend``."""
-        self._lent = False
+        self._in_direct_use = False
         self.resume()
 
     def pause(self) -> None:
@@ -483,7 +483,9 @@ class LocalChild:
             self.observer.recalled(self._recall())
 
     def _receive(self) -> None:
-        if not self._lent:  # an event from before ``lend``: its packet is for the channel's user
+        if (
+            not self._in_direct_use
+        ):  # an event from before ``lend``: its packet is for the channel's user
             self._hear()
 
     def _hear(self) -> bool:

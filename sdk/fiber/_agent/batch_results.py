@@ -16,7 +16,7 @@ from operator import length_hint
 from typing import Any, Protocol
 
 from fiber._agent import by_reference
-from fiber._agent.travelling import encode_error, unsendable
+from fiber._agent.exception_pickles import encode_error, unsendable
 from fiber._hub.remote import Taken, confirm
 from fiber._wire import packet, work
 

@@ -178,12 +178,12 @@ class ChildHandle(Protocol):
     def lend(self) -> DirectChannel | None:
         """Return the task channel for direct use by one thread at a time, until ``reclaim``.
 
-        None: the child is gone, or its channel cannot be lent.  Until ``reclaim`` the observer gets
-        no packets, only the child's end.  Runs on the loop's thread.
+        None: the child is gone, or its channel cannot be used directly.  Until ``reclaim`` the
+        observer gets no packets, only the child's end.  Runs on the loop's thread.
         """
 
     def reclaim(self) -> None:
-        """End the lending: the observer gets the packets again.  Runs on the loop's thread."""
+        """End the direct use: the observer gets the packets again.  Runs on the loop's thread."""
 
     def recall(self) -> None:
         """Take back the packets that the child has not read; ``recalled`` says which."""

@@ -168,7 +168,7 @@ class MemoryLimit:
         limit = _read(self._maximum).strip()
         if limit.isdigit():
             return f"its memory limit is {_quantity(int(limit))}"
-        return "no limit of its own"
+        return "its container has no memory limit"
 
     def _count(self) -> int:
         for line in _read(self._events).splitlines():

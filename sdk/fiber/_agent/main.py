@@ -42,7 +42,9 @@ _INHERITS = "FIBER_AGENT_INHERITS"
 _DIRECTORY = "FIBER_AGENT_DIRECTORY"
 _REPORT = "FIBER_AGENT_REPORT"
 _LOST_GRACE = "FIBER_AGENT_LOST_GRACE"
-_WAITS_UNTIL = "FIBER_AGENT_WAITS_UNTIL"  # time.monotonic(), from an agent to its next life
+_WAITS_UNTIL = (
+    "FIBER_AGENT_WAITS_UNTIL"  # time.monotonic(), from an agent to itself after its restart
+)
 
 _TERMINATION_GRACE = "FIBER_AGENT_TERMINATION_GRACE"
 _LINKED = "FIBER_AGENT_LINKED"
@@ -81,7 +83,7 @@ _REFUSED_PAUSE = 0.5
 
 
 class Main:
-    """The life of an agent: dial, serve, end."""
+    """Main function of an agent's process: dial, serve, end."""
 
     def __init__(self) -> None:
         self._environment = dict(os.environ)
@@ -110,7 +112,7 @@ class Main:
         self._service: AgentService | None = None
         self._status = 0
         self._again = False
-        self._told_to_end = False
+        self._terminating = False
         # From here on there is a directory, which must be removed at a SIGTERM too.
         signal.signal(signal.SIGTERM, self._on_sigterm)
         parent, directory = config.current().runtime_directory, os.environ.pop(_DIRECTORY, None)
@@ -126,24 +128,24 @@ class Main:
         self._dialer = self._dial()
         self._wake_by_signals()
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-        signal.pthread_sigmask(signal.SIG_SETMASK, ())  # an earlier life or the starter blocks some
+        signal.pthread_sigmask(signal.SIG_SETMASK, ())  # its last run or the starter blocks some
         self._end_with_parent()
         self._loop.run()
         self._dialer.close()
         self._agent.close()
         self._hub.close()
-        # From here on a SIGTERM is for the next life, which unblocks the signal once it is ready.
+        # From here on a SIGTERM is for the next run, which unblocks the signal once it is ready.
         signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGTERM,))
-        if self._again and not self._is_told_to_end():
+        if self._again and not self._is_terminating():
             # No process or file of the last master may reach the next one.
             why_not = self._unfit_for_another()
             if why_not is not None:
                 self._complain(why_not)
                 return 1
-            command = _next_life()
+            command = _restart_command()
             self._hand_on_credentials()
             # The lines above take seconds, in which another thread may have taken the signal.
-            if not self._is_told_to_end():
+            if not self._is_terminating():
                 os.execve(sys.executable, command, self._environment)
         signal.set_wakeup_fd(-1)
         for end in self._signals:
@@ -211,26 +213,26 @@ class Main:
     def _ended(self, reason: str, lost: bool) -> None:
         if lost:
             self._complain(reason)
-        if self._lost_grace is not None and not self._told_to_end:
+        if self._lost_grace is not None and not self._terminating:
             self._again = True
             self._environment.pop(_WAITS_UNTIL, None)
             if lost:
-                told = self._dialer.lost_grace
-                grace = self._lost_grace if told is None else told
+                seconds = self._dialer.lost_grace
+                grace = self._lost_grace if seconds is None else seconds
                 self._environment[_WAITS_UNTIL] = str(time.monotonic() + grace)
         elif lost:
             self._status = 1
-        linger = self._cleaning_up if self._told_to_end else 1.0
+        linger = self._cleaning_up if self._terminating else 1.0
         self._link.close(reason, linger=linger, then=self._loop.stop)
 
-    def _is_told_to_end(self) -> bool:
+    def _is_terminating(self) -> bool:
         """Return whether SIGTERM came, also if another thread took it and no handler ran yet."""
         try:
             taken = self._signals[0].recv(4096)
         except BlockingIOError:
             taken = b""
-        self._told_to_end |= signal.SIGTERM in taken
-        return self._told_to_end
+        self._terminating |= signal.SIGTERM in taken
+        return self._terminating
 
     def _wake_by_signals(self) -> None:
         """Have signals wake the loop.
@@ -246,7 +248,7 @@ class Main:
         signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
 
     def _on_sigterm(self, *_: object) -> None:
-        self._told_to_end = True
+        self._terminating = True
         self._loop.call_soon(self._drain)
 
     def _drain(self) -> None:
@@ -272,7 +274,7 @@ class Main:
         os._exit(0)
 
 
-def _next_life() -> list[str]:
+def _restart_command() -> list[str]:
     """Return the command of an agent that cannot import modules that a task has written.
 
     The environment is for its children.  The agent's own interpreter ignores it.

@@ -291,8 +291,8 @@ class _Observed:
         if self.drained and report.exitcode == -signal.SIGKILL:
             report = report._replace(cause=Cause.DRAINED)
         log = self._capture.finish() if self._capture is not None else ()
-        told: Any = report._replace(log=log)[:_KNOWN_HERE]
-        end = messages.Exited(self._number, self._delivered, *told)
+        fields: Any = report._replace(log=log)[:_KNOWN_HERE]
+        end = messages.Exited(self._number, self._delivered, *fields)
         self._service.send(end)
         self._service.forget(self._number)
 

@@ -27,7 +27,7 @@ from typing import Any
 
 from fiber._agent import child
 from fiber._agent.batch_results import BatchResults, ResultChannel
-from fiber._agent.travelling import encode_error, format_error
+from fiber._agent.exception_pickles import encode_error, format_error
 from fiber._hub.remote import Taken, confirm, loads
 from fiber._wire import work
 from fiber._wire.packet import Message

@@ -462,8 +462,10 @@ class AgentLauncher:
     """
 
     def __init__(self, timeout: float, on_trouble: Callable[[str], None]) -> None:
-        """``on_trouble`` is told, on the thread, what keeps one from starting that is tried again
-        for ``timeout`` seconds.
+        """Start the thread.
+
+        A start that fails is repeated for ``timeout`` seconds.  ``on_trouble`` gets the reason of
+        each failure, on the thread.
         """
         self._timeout = timeout
         self._on_trouble = on_trouble

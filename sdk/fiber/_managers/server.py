@@ -19,7 +19,7 @@ from traceback import format_exc
 from typing import Any
 
 from fiber import reduction
-from fiber._agent.travelling import Travelling
+from fiber._agent.exception_pickles import PickledException
 from fiber._hub.handles import GrantSet
 from fiber._hub.local import LocalChannel
 from fiber._hub.protocol import ObjectKind
@@ -286,8 +286,8 @@ def _no_object(ident: str) -> KeyError:
 
 def _error_answer(error: BaseException) -> _Answer:
     """Return the answer for an error that a method raised: the error itself if it pickles."""
-    travelling = Travelling(error)
-    return ("#ERROR", travelling) if travelling.whole else ("#TRACEBACK", travelling.text)
+    pickled = PickledException(error)
+    return ("#ERROR", pickled) if pickled.whole else ("#TRACEBACK", pickled.text)
 
 
 def _reply(channel: Channel, number: int, answer: _Answer) -> Any:

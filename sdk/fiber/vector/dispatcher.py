@@ -123,11 +123,11 @@ class Dispatcher:
         self._move_idle_workers()
         commands = []
         for group in self._groups(numbers):
-            told = {
+            pending = {
                 row: PendingCommand("reset", seeds[position], options[position])
                 for row, position in zip(group.each(), group.positions, strict=True)
             }
-            commands.append((group, told, _reset_command(group.worker, group.rows, told)))
+            commands.append((group, pending, _reset_command(group.worker, group.rows, pending)))
         self._send_commands(commands)
 
     def call(
@@ -411,8 +411,8 @@ class Dispatcher:
     def _resume(self, worker: WorkerProcess) -> None:
         """Send a new process the commands that the one before has not answered."""
         self._begin(worker)
-        steps = [row for row, told in worker.pending.items() if told is _STEP]
-        resets = {row: told for row, told in worker.pending.items() if told is not _STEP}
+        steps = [row for row, command in worker.pending.items() if command is _STEP]
+        resets = {row: command for row, command in worker.pending.items() if command is not _STEP}
         if steps:
             # These episodes are lost, so the steps need no actions.
             self._send(worker, _encoded(worker, "step", steps, [None] * len(steps), False))
@@ -430,10 +430,10 @@ def _encoded(
 
 
 def _reset_command(
-    worker: WorkerProcess, rows: Sequence[int] | None, told: dict[int, PendingCommand]
+    worker: WorkerProcess, rows: Sequence[int] | None, pending: dict[int, PendingCommand]
 ) -> bytes:
-    seeds = [each.seed for each in told.values()]
-    return _encoded(worker, "reset", rows, seeds, [each.options for each in told.values()])
+    seeds = [each.seed for each in pending.values()]
+    return _encoded(worker, "reset", rows, seeds, [each.options for each in pending.values()])
 
 
 def _only_reports_losses(message: Answer | Results) -> bool:

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 from gymnasium.vector import AutoresetMode
 
 from fiber import reduction
-from fiber._agent.travelling import encode_error
+from fiber._agent.exception_pickles import encode_error
 from fiber._exceptions import add_note
 from fiber._hub import client
 from fiber.connection import Connection

@@ -83,10 +83,10 @@ class AgentRoute(NamedTuple):
 
 def new_problems(pool: PoolName, before: Status, status: Status) -> Iterator[str]:
     """Yield a sentence for each problem that ``before`` did not have, or only as a warning."""
-    told = {(problem.get("reason"), problem.get("severity")) for problem in _problems(before)}
+    known = {(problem.get("reason"), problem.get("severity")) for problem in _problems(before)}
     for problem in _problems(status):
         reason = problem.get("reason")
-        if not told & {(reason, problem.get("severity")), (reason, "Error")}:
+        if not known & {(reason, problem.get("severity")), (reason, "Error")}:
             count = problem.get("count", 1)
             many = f" ({count} pods)" if problem.get("pod") and count > 1 else ""
             yield f"{pool}: {reason}{many}: {problem.get('message', '')}"
@@ -296,10 +296,10 @@ _DISRUPTIONS = {
 def _disruption(pod: Mapping[str, Any]) -> str | None:
     status = pod.get("status") or {}
     conditions = status.get("conditions") or ()
-    for told in (status, *(c for c in conditions if c.get("type") == "DisruptionTarget")):
-        word = _DISRUPTIONS.get(str(told.get("reason")))
-        if word and told.get("status") != "False":
-            return _sentence(word, str(told.get("message") or ""))
+    for source in (status, *(c for c in conditions if c.get("type") == "DisruptionTarget")):
+        word = _DISRUPTIONS.get(str(source.get("reason")))
+        if word and source.get("status") != "False":
+            return _sentence(word, str(source.get("message") or ""))
     return None
 
 

@@ -258,8 +258,8 @@ def own_container(pod: Mapping[str, Any], mountinfo: str) -> str:
     containers = [container["name"] for container in pod["spec"]["containers"]]
     seen = _TERMINATION_LOG.search(mountinfo)
     annotations = pod["metadata"].get("annotations") or {}
-    told = annotations.get("kubectl.kubernetes.io/default-container")
-    for name in (seen and seen[1], told):
+    default = annotations.get("kubectl.kubernetes.io/default-container")
+    for name in (seen and seen[1], default):
         if name in containers:
             return str(name)
     return str(containers[0])

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from fiber._agent.travelling import LINKS, encode_error
+from fiber._agent.exception_pickles import LINKS, encode_error
 from unit import exception_kinds as kinds
 
 

@@ -47,7 +47,7 @@ _PLAIN_ERRORS = frozenset(
 
 def encode_error(error: BaseException) -> bytes:
     """Pickle an error, with its traceback as text, in a form that always unpickles."""
-    return pickle.dumps(Travelling(error))
+    return pickle.dumps(PickledException(error))
 
 
 def format_error(error: BaseException) -> str:
@@ -61,7 +61,7 @@ def format_error(error: BaseException) -> str:
         return f"Traceback (most recent call last):\n{frames}{_shown(error)}\n"
 
 
-class Travelling:
+class PickledException:
     """Placeholder of an exception in a pickle: unpickling returns the exception itself.
 
     The ``__cause__`` of the result is multiprocessing's RemoteTraceback.  Causes and contexts are
@@ -183,7 +183,7 @@ def _by_reference(file: io.BytesIO, reduce: _Reduce) -> pickle.Pickler:
     return by_reference.pickler(file, _Exceptions(reduce, {}))
 
 
-class _State(NamedTuple):
+class _ExceptionState(NamedTuple):
     """State of an exception that its native base rebuilds."""
 
     args: tuple[Any, ...]
@@ -193,7 +193,7 @@ class _State(NamedTuple):
     """True if the class has a ``__setstate__`` that takes the attributes."""
 
     @classmethod
-    def of(cls, error: BaseException) -> _State:
+    def of(cls, error: BaseException) -> _ExceptionState:
         own = _state_for_setstate(error)
         attributes = dict(vars(error) if own is None else own)
         fields = _fields(error)
@@ -232,7 +232,7 @@ class _Whole:
     def member(self, error: BaseException) -> _Reduced:
         """Reduce a separate member to its pickle, or to its state if that is plain."""
         if _has_plain_state(error) and (kind := self._kind(type(error))) is not None:
-            return _received_of_kind, (kind, tuple(_State.of(error)), _shown(error))
+            return _received_of_kind, (kind, tuple(_ExceptionState.of(error)), _shown(error))
         group = self.separate[id(error)]
         separate, self.separate = self.separate, {}
         self.open.add(group)
@@ -345,7 +345,7 @@ class _Pickling:
         if group and id(error) not in self._whole.open:
             others = (member for member in group[1] if not _is_plain(member))
             self._whole.separate.update((id(member), id(error)) for member in others)
-        state = _State.of(error)
+        state = _ExceptionState.of(error)
         if self._incomplete:
             state = self._without_refused(error, state)
         reduced = make, (type(error), group), tuple(state), None, None, _set_state
@@ -361,7 +361,7 @@ class _Pickling:
             self._own_reduce_works[id(error)] = error, not self._refusal(error)
         return self._own_reduce_works[id(error)][1]
 
-    def _without_refused(self, error: BaseException, state: _State) -> _State:
+    def _without_refused(self, error: BaseException, state: _ExceptionState) -> _ExceptionState:
         """Drop attributes that cannot travel, and turn such arguments into text; note both."""
         self._open.add(id(error))
         try:
@@ -369,7 +369,7 @@ class _Pickling:
         finally:
             self._open.remove(id(error))
 
-    def _parts(self, state: _State) -> _State:
+    def _parts(self, state: _ExceptionState) -> _ExceptionState:
         notes = []
         for values in (state.attributes, state.fields):
             for name, value in [*values.items()]:
