@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,10 @@ VAGUE_NAMES = {"utils", "helpers", "common", "misc"}
 CLOCKS = {"monotonic", "perf_counter", "process_time", "thread_time", "time"}
 # What only a part of Fiber needs; a program that imports Fiber and does nothing has none of it.
 HEAVY = {"asyncio", "cloudpickle", "cryptography", "kubernetes", "numpy", "pydantic", "pynng"}
+
+# Classes of two programs or modules that mean the same: errors of the API server for the SDK and for
+# the operator, and the error of executors, which is also a BrokenProcessPool.
+SAME_NAMES = {"ApiError", "Conflict", "Invalid", "WorkerDied"}
 
 
 def python_files() -> list[Path]:
@@ -79,6 +84,18 @@ def test_files_are_short() -> None:
 
 def test_names_say_what_is_inside() -> None:
     assert [path for path in python_files() if path.stem.strip("_") in VAGUE_NAMES] == []
+
+
+def test_a_class_name_names_one_class() -> None:
+    """A search for a name finds one definition."""
+    defined = Counter(
+        statement.name
+        for folder in ("sdk", "crds", "operator")
+        for path in sorted((ROOT / folder).rglob("*.py"))
+        for statement in ast.parse(path.read_text(encoding="utf-8")).body
+        if isinstance(statement, ast.ClassDef)
+    )
+    assert {name for name, count in defined.items() if count > 1} == SAME_NAMES
 
 
 def test_nothing_shadows_the_standard_library() -> None:
