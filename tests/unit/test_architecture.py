@@ -19,8 +19,8 @@ CLOCKS = {"monotonic", "perf_counter", "process_time", "thread_time", "time"}
 # What only a part of Fiber needs; a program that imports Fiber and does nothing has none of it.
 HEAVY = {"asyncio", "cloudpickle", "cryptography", "kubernetes", "numpy", "pydantic", "pynng"}
 
-# Classes of two programs or modules that mean the same: errors of the API server for the SDK and for
-# the operator, and the error of executors, which is also a BrokenProcessPool.
+# Classes of two modules that mean the same: errors of the API server for the SDK and for the
+# operator, and the error of executors, which is also a BrokenProcessPool.
 SAME_NAMES = {"ApiError", "Conflict", "Invalid", "WorkerDied"}
 
 
