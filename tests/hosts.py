@@ -19,7 +19,7 @@ from patience import PATIENCE
 
 
 class Wire:
-    """One direction of a link: encodes frames, counts them, and can be stopped."""
+    """Direction of a link: encodes frames, counts them, and can be stopped."""
 
     def __init__(self, loop: Loop) -> None:
         self._loop = loop

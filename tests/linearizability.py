@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 
 class Operation(NamedTuple):
-    """One operation of a process, with its result."""
+    """Operation of a process, with its result."""
 
     name: str
     argument: Hashable

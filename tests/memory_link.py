@@ -142,7 +142,7 @@ class Cable:
 
 
 class MemoryWire:
-    """One end of one connection; a ``LinkConnection``."""
+    """End of one connection; a ``LinkConnection``."""
 
     def __init__(self, cable: Cable, link: Link) -> None:
         self.other: MemoryWire | None = None

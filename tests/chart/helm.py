@@ -42,10 +42,7 @@ class Helm:
     program: str
     home: Path
     _rendered: dict[str, str] = field(default_factory=dict)
-    """Cache of rendered charts by their arguments:
-
-    a chart renders the same each time, and Helm is slow.
-    """
+    """Cache of rendered charts by their arguments, because Helm is slow."""
 
     def render(self, values: Values = DEFAULTS, *, release: str = RELEASE) -> list[Manifest]:
         """Every manifest for these values, hooks included, in Helm's order."""

@@ -1,7 +1,4 @@
-"""Scope of the operator:
-
-one switch sets what it may do, what it watches, and where it is tested.
-"""
+"""Scope of the operator: one switch sets its rights, what it watches, and where it is tested."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ _KEEPER = (
 
 
 class Daemon:
-    """One process by its name, running or not."""
+    """Process by its name, running or not."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -111,10 +111,7 @@ class Daemon:
         self._status_file.unlink(missing_ok=True)
 
     def status(self) -> int | None:
-        """Return its exit status as a shell counts:
-
-        128 and more is a signal. None if it was not recorded.
-        """
+        """Return its exit status as a shell counts (128 and more: a signal); None if unrecorded."""
         try:
             return int(self._status_file.read_text())
         except (OSError, ValueError):

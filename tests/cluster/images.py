@@ -33,7 +33,7 @@ ALWAYS = (".dockerignore", "LICENSE", "README.md", "pyproject.toml")
 
 @dataclass(frozen=True)
 class Image:
-    """One image of the project: its name and its inputs below the checkout."""
+    """Image of the project: its name and its inputs below the checkout."""
 
     name: str
     dockerfile: str

@@ -1,4 +1,4 @@
-"""One node: a containerd, a kubelet and a kube-proxy in one network namespace."""
+"""Node of the cluster: a containerd, a kubelet and a kube-proxy in one network namespace."""
 
 from __future__ import annotations
 

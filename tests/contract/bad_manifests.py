@@ -30,7 +30,7 @@ MASTER: Final = {"host": "10.0.3.7", "port": 41337, "epoch": 3, "identity": "lap
 
 @dataclass(frozen=True)
 class Bad:
-    """One manifest to be refused."""
+    """Manifest to be refused."""
 
     name: str
     change: Mapping[str, Any]

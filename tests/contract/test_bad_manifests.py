@@ -1,7 +1,4 @@
-"""Comparison of the models with the API server:
-
-both refuse the same manifests and name the field.
-"""
+"""Comparison of models and API server: both refuse the same manifests and name the field."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ def template(image: str, *command: str, **container: Any) -> Body:
 
 
 class Pool:
-    """One FiberPool. All reads come from the scene's watches."""
+    """FiberPool of a test. All reads come from the scene's watches."""
 
     def __init__(self, scene: Scene, name: str) -> None:
         self.scene = scene

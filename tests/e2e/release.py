@@ -26,7 +26,7 @@ _LABEL = re.compile(r'(\w+)="([^"]*)"')
 
 
 class Release:
-    """One release."""
+    """Release of the chart."""
 
     def __init__(
         self, kube: Kube, name: str, namespace: str, images: Mapping[str, str], home: Path

@@ -21,7 +21,7 @@ _WATCHED = ("fiberpools", "pods", "endpointslices")
 
 @dataclass(frozen=True)
 class Moment:
-    """One change, and when the watch reported it."""
+    """Change of an object, and when the watch reported it."""
 
     at: float
     """Seconds of the monotonic clock."""

@@ -25,7 +25,7 @@ BOOKMARK_SECONDS = 60.0
 
 @dataclass(frozen=True)
 class Call:
-    """One request, as RBAC sees it."""
+    """Request, as RBAC sees it."""
 
     verb: str
     plural: str

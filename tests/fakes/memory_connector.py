@@ -15,7 +15,7 @@ from fakes.kubernetes_api import KubernetesApi
 
 
 class _End(asyncio.Transport):
-    """One end of a connection: the other end's protocol receives the bytes written here."""
+    """End of a connection: the other end's protocol receives the bytes written here."""
 
     def __init__(self, protocol: asyncio.Protocol) -> None:
         super().__init__({"peername": ("127.0.0.1", 1), "sockname": ("127.0.0.1", 2)})

@@ -53,7 +53,7 @@ class Failure(Exception):
 
 
 class Change(NamedTuple):
-    """One event of a watch."""
+    """Event of a watch."""
 
     version: int
     type: str

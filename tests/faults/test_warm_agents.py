@@ -74,7 +74,7 @@ MASTER = """
 
 
 class Pool:
-    """One address where masters come and go, and one agent that dials it."""
+    """Address where masters come and go, and one agent that dials it."""
 
     def __init__(self, launch: Callable[..., Program], folder: Path) -> None:
         self.credentials: MasterCredentials = make_credentials("ab" * 32)

@@ -28,7 +28,7 @@ SAME_HOST = schedule.Agent(1e-5, 5e-5)
 
 
 class Line:
-    """One direction of the way to a host: nothing is lost or overtaken, but all of it may wait."""
+    """Direction of the way to a host: packets keep their order and may be delayed."""
 
     def __init__(self, loop: SimulatedLoop, rng: random.Random, plan: schedule.Agent) -> None:
         self._loop = loop
@@ -62,12 +62,12 @@ class Line:
             callback(*args)
 
     def forget(self) -> None:
-        """What waited is lost."""
+        """Drop the delayed packets."""
         self._held.clear()
 
 
 class Agent:
-    """One host with its workers."""
+    """Host with its workers."""
 
     def __init__(self, world: World, number: int, plan: schedule.Agent) -> None:
         self.world = world
@@ -102,7 +102,7 @@ class Agent:
 
     @property
     def is_cut(self) -> bool:
-        """Whether nothing gets through."""
+        """Return whether the way is closed."""
         return self.up.is_cut
 
     def ended(self, child: Child) -> None:
@@ -122,8 +122,8 @@ class Agent:
     def _mend(self) -> None:
         self.world.note("%s is back", self.host)
         if self.lost:
-            # The session has ended: the agent ends its workers, and what was on its way to them is
-            # gone.  Their last words come late.
+            # The session has ended: the agent ends its workers, and packets on their way to them
+            # are gone. The workers' last packets come late.
             self.down.forget()
             self.kill_all()
             self._children.clear()
@@ -144,14 +144,14 @@ class Channel(Protocol):
         """The worker sent it."""
 
     def drain(self) -> list[Any]:
-        """What nobody has received."""
+        """Return the packets that were not received."""
 
     def end(self) -> None:
         """The worker is gone."""
 
 
 class Child:
-    """One worker, as the master holds it (a ``ChildHandle``) and as its agent does."""
+    """Worker, as its master (a ``ChildHandle``) and as its agent hold it."""
 
     def __init__(self, agent: Agent, number: int, observer: ChildObserver) -> None:
         self.name = f"worker {number}"
@@ -182,7 +182,7 @@ class Child:
         return True
 
     def lend(self) -> Any:
-        """Its channel, for direct use."""
+        """Return its channel, for direct use."""
         if self.gone:
             return None
         self._channel = self.agent.world.make_channel(self)
@@ -239,7 +239,7 @@ class Child:
     # At the master
 
     def give_up(self) -> None:
-        """Its agent is lost, and nothing is known of it any more."""
+        """Lose its agent, and with it all knowledge of the worker."""
         reason, cause = f"agent {self.host} lost", Cause.AGENT_LOST
         report = ExitReport(-signal.SIGKILL, reason, host=self.host, cause=cause)
         self._end(report)

@@ -1,4 +1,4 @@
-"""What must hold inside a ledger, looked at after every event."""
+"""Invariants of a ledger, checked after every event."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ class Names(Protocol):
         """Whose job it is; None if it is that of many."""
 
     def ref(self, job: Job, index: int, item: Any) -> Ref:
-        """Which task ``item``, the ``index``-th of ``job``, is."""
+        """Return the name of the task that ``item``, the ``index``-th of ``job``, is."""
 
     def child(self, worker: WorkerEntry) -> Child:
-        """Which process it is."""
+        """Return the simulated process of a worker."""
 
 
 class Audit:
@@ -268,7 +268,7 @@ class Audit:
     # The whole
 
     def check(self) -> None:
-        """Each task is in one place, each worker where it belongs, nobody idle without need."""
+        """Check that each task and worker is in its one place, and that none idles without need."""
         self._check_workers()
         forgotten = {job for job in self._jobs - self._ledger.jobs if not job.finished}
         require(not forgotten, "the ledger has forgotten a job")
@@ -363,7 +363,7 @@ class Audit:
             )
 
     def check_end(self) -> None:
-        """Nothing happens any more."""
+        """Check the ledger once no event is left."""
         ledger = self._ledger
         require(not ledger.batches, f"batches {list(ledger.batches)} are left over")
         require(not ledger.demand(), f"{ledger.demand()} tasks are left over")

@@ -31,7 +31,7 @@ from simulation.world import World
 
 
 class Again(Exception):
-    """What the pool retries."""
+    """Error that the pool retries."""
 
 
 OWNER = "the pool's owner"
@@ -52,7 +52,7 @@ class Names:
         return account
 
     def ref(self, job: engine.Job, index: int, item: Any) -> Ref:
-        """Which task ``item`` is."""
+        """Return the name of the task that ``item`` is."""
         if not isinstance(item, Call):
             return Ref(*item)
         account = self.account(job)
@@ -62,7 +62,7 @@ class Names:
         return Ref(future.account.number, future.call)
 
     def child(self, worker: engine.WorkerEntry) -> Child:
-        """Which process it is."""
+        """Return the simulated process of a worker."""
         handle = worker.key.child
         if isinstance(handle, RemoteChild):
             seen: Any = handle.observer
@@ -72,7 +72,7 @@ class Names:
 
 
 class ExecutorMaster:
-    """Plays the pool's user, each job on a thread of its own."""
+    """User of the pool, with one thread for each job."""
 
     def __init__(self, world: World, make: type[PoolExecutor] = PoolExecutor) -> None:
         self.world = world
@@ -90,7 +90,7 @@ class ExecutorMaster:
         self._open_calls: dict[int, int] = {}
         self._started = False
         self._planned: list[Callable[[], None]] = []
-        """What the owner does once the pool has started."""
+        """Steps of the owner once the pool has started."""
 
     def begin(self) -> None:
         """Start the workers, and plan the jobs."""
@@ -152,7 +152,7 @@ class ExecutorMaster:
         self._executor.broadcast(future, perform, (account.number,))
 
     def _call(self, account: Account, future: Outcomes, start: int = 0) -> None:
-        """One call after the other; those fed together follow at once."""
+        """Make one call after the other; those fed together follow at once."""
         plan = account.plan
         stop = min(start + plan.bite, len(plan.tasks))
         account.closed = stop == len(plan.tasks)
@@ -184,7 +184,7 @@ class ExecutorMaster:
             self._call(account, future, start)
 
     def _goes_no_further(self, account: Account, future: Outcomes, refused: int) -> None:
-        """What was asked before counts."""
+        """End a job early: only its earlier calls count."""
         self.world.note("job %d goes no further", account.number)
         account.fed -= refused
         account.closed = account.refused = True
@@ -193,7 +193,7 @@ class ExecutorMaster:
             future.set_done()
 
     def _direct_call(self, account: Account, future: Outcomes) -> None:
-        """One call after the other has its result."""
+        """Take the result of one call after the other."""
         if account.plan.tasks:
             body = partial(self._apply_all, account)
             self._stage.act(_user(account), body).start()
@@ -256,7 +256,7 @@ class ExecutorMaster:
         return future.item
 
     def _items(self, account: Account) -> list[Any]:
-        # What is plain is pickled on any thread, the rest must not be on the loop's.
+        # Any thread pickles plain values; the loop must not pickle the others.
         kind: Callable[[tuple[int, int]], Any] = self._rng.choice((tuple, self._stage.item))
         tasks = account.plan.tasks
         if any(task.act is Act.UNSENDABLE for task in tasks):
@@ -331,7 +331,7 @@ class ExecutorMaster:
                 future.item.stream.ask()
 
     def holds_back(self, item: WorkItem) -> bool:
-        """Whether the user has more results than it reads; until a little later."""
+        """Return whether the user has more results than it reads; until a little later."""
         future: Any = item.future
         if self._pool.joined or self._rng.random() >= 0.05:
             return False
@@ -341,7 +341,7 @@ class ExecutorMaster:
         return True
 
     def waits_for_all(self, account: Account) -> None:
-        """Nobody reads the results of a job: all are taken."""
+        """Check that the pool is joined if all results of an unread job are taken."""
         require(self._pool.joined, f"job {account.number} is not held back any more")
 
     def _cancel(self, account: Account) -> None:
@@ -350,7 +350,7 @@ class ExecutorMaster:
             return
         self.world.note("job %d is cancelled", account.number)
         self._executor.cancel(item)
-        # What comes until the loop has heard of it is the user's.
+        # Results that come until the loop has the news belong to the user.
         self.world.loop.call_soon(self._is_cancelled, account)
 
     def _is_cancelled(self, account: Account) -> None:
@@ -389,12 +389,12 @@ class ExecutorMaster:
 
     @property
     def is_closing(self) -> bool:
-        """Whether the pool takes nothing more."""
+        """Return whether the pool is closed to new work."""
         return self._executor._scheduler.closing
 
     @property
     def starved(self) -> bool:
-        """Whether the pool may say that no worker starts."""
+        """Return whether the pool may say that no worker starts."""
         return self._pool.starved
 
     def _check(self) -> None:
@@ -460,7 +460,7 @@ def _retries(schedule: Schedule) -> bool:
 
 
 def for_pool(schedule: Schedule) -> Schedule:
-    """What the user of a pool can ask for: retries, for one, are the pool's."""
+    """Limit a schedule to a pool's features; retries, for one, belong to the pool."""
     retries = schedule.jobs[0].retries
     return replace(schedule, jobs=tuple(_for_pool(job, retries) for job in schedule.jobs))
 

@@ -24,7 +24,7 @@ class Suite(NamedTuple):
     adapt: Callable[[Schedule], Schedule] = lambda schedule: schedule
     """Makes a schedule possible for it."""
     remote: type[Agent] = Agent
-    """How hosts are simulated that are not the master's own."""
+    """Simulations of hosts other than the master's own."""
     share: float = 1.0
     """The part of all seeds that it runs: it may be slow."""
 
@@ -56,10 +56,10 @@ class Failure(Exception):
 
 
 def run(schedule: Schedule, suite: Suite, trace: list[str] | None = None) -> Exception | None:
-    """What goes wrong in one run."""
+    """Return the failure of one run, if any."""
     try:
         World(suite.adapt(schedule), suite.make, trace, suite.remote).run()
-    except Exception as error:  # also what the code under test raises by mistake
+    except Exception as error:  # also errors that the code under test raises by mistake
         return error
     return None
 
@@ -101,7 +101,7 @@ def shrink(schedule: Schedule, suite: Suite) -> Schedule:
 
 
 def _kind(error: Exception | None) -> tuple[type | None, str]:
-    """What makes two failures the same: all but the numbers."""
+    """Return the identity of a failure: its type, and its text without numbers."""
     return type(error) if error else None, re.sub(r"\d+(, \d+)*", "", str(error))
 
 

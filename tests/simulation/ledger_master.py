@@ -22,7 +22,7 @@ from simulation.world import World
 
 
 def for_ledger(schedule: Schedule) -> Schedule:
-    """Its driver starts workers without a pause, so some must be able to start."""
+    """Remove famines: this master starts workers without a pause, so some must start."""
     faults = tuple(fault for fault in schedule.faults if not isinstance(fault, Famine))
     return replace(schedule, faults=faults)
 
@@ -46,7 +46,7 @@ STOP = 0
 
 
 class Member:
-    """One worker of the pool; a ``ChildObserver``."""
+    """Worker of the pool; a ``ChildObserver``."""
 
     def __init__(self, master: LedgerMaster) -> None:
         self.child: Child
@@ -56,21 +56,21 @@ class Member:
         self._master = master
 
     def started(self, pid: int) -> None:
-        """It exists."""
+        """Note that the worker exists."""
 
     def received(self, message: Any) -> None:
-        """It said something."""
+        """Take a message of the worker."""
         self._master.heard(self, message)
 
     def recalled(self, seqs: list[int]) -> None:
-        """It did not read these."""
+        """Take back the packets that it did not read."""
         self._master.recalled(self, seqs)
 
     def draining(self) -> None:
-        """Its host is about to go."""
+        """Note that its host is about to go."""
 
     def exited(self, report: ExitReport) -> None:
-        """It is gone."""
+        """Note the end of the worker."""
         self._master.exited(self, report)
 
     def stop(self) -> None:
@@ -88,12 +88,12 @@ class Names:
         return account
 
     def ref(self, job: engine.Job, index: int, item: Any) -> Ref:
-        """Which task ``item`` is."""
+        """Return the name of the task that ``item`` is."""
         ref: Ref = item
         return ref
 
     def child(self, worker: engine.WorkerEntry) -> Child:
-        """Which process it is."""
+        """Return the simulated process of a worker."""
         child: Child = worker.key.child
         return child
 
@@ -116,7 +116,7 @@ class LedgerMaster:
         self._recall_at: float | None = None
         self._idle_since: dict[engine.WorkerEntry, float] = {}
         self._direct: dict[engine.WorkerEntry, int] = {}
-        """What leased workers were sent by those who use them."""
+        """Packets that the callers of leased workers have sent."""
         self._adopted: list[engine.Job] = []
 
     def begin(self) -> None:
@@ -169,7 +169,7 @@ class LedgerMaster:
         items = [Ref(account.number, index) for index in range(start, stop)]
         self.world.note("job %d is fed %d tasks", account.number, len(items))
         self.ledger.feed(job, self._rng.choice((items, items, tuple(items))))
-        if not account.cancelled:  # otherwise they are for nobody
+        if not account.cancelled:  # otherwise no caller wants them
             self.world.oracle.fed(account.number, len(items))
         if stop < len(plan.tasks):
             self._later(plan.pause, self._feed, account, job, stop)
@@ -224,7 +224,7 @@ class LedgerMaster:
             if self.ledger.held(worker, said.seq) is not None:
                 self._split(said.seq)
         elif self._direct.get(worker) == said.seq:
-            del self._direct[worker]  # its caller hears it
+            del self._direct[worker]  # its caller gets the result
         else:
             self._take(worker, said)
 
@@ -267,7 +267,7 @@ class LedgerMaster:
 
     def _look(self, job: engine.Job) -> None:
         account: Account = job.owner
-        # Of several results that come at once the job has counted all before the first is told.
+        # Of several results that arrive together, the job counts all before it reports the first.
         if job.finished and account.delivered == account.everything:
             self._finished(account)
 
@@ -359,7 +359,7 @@ class LedgerMaster:
         self._later(self._rng.choice((1e-5, 1e-3, 0.1)), self._return, worker)
 
     def _return(self, worker: engine.WorkerEntry) -> None:
-        """Its user leaves it, and perhaps an answer that has not come yet."""
+        """Give back the worker, perhaps with an answer that has not come yet."""
         if worker not in self.ledger.workers:
             return
         self.world.note("%s is returned", worker.key.child.name)
@@ -406,7 +406,7 @@ class LedgerMaster:
         self.ledger.starting += 1
 
     def _dismiss(self, worker: engine.WorkerEntry, since: float) -> None:
-        """It had nothing to do for a while."""
+        """Ask a worker to end that was idle for a while."""
         member: Member = worker.key
         staying = sum(not member.leaving for member in self._members.values())
         idle = worker in self.ledger.idle() and worker.since == since
@@ -428,10 +428,10 @@ class LedgerMaster:
         return True
 
     def leave_process(self) -> None:
-        """It took nothing from the process."""
+        """Do nothing: the master changes no global state of the process."""
 
     def check_end(self) -> None:
-        """Nothing may be left over."""
+        """Check that no work is left over."""
         if not all(job.finished for job in self._adopted):
             raise Violation("the answer to a direct call never comes")
         self._audit.check_end()

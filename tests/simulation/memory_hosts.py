@@ -54,13 +54,13 @@ class Host:
         self.wires: dict[str, deque[MemoryMessage | Passing]] = {}
 
     def connect(self, other: Host, *, dialer: bool) -> None:
-        """This side of a link."""
+        """Near side of a link."""
         wire = self.wires[other.name] = deque()
         towards = None if dialer else other.name
         self.links[other.name] = self.replicas.link(towards, wire.append, dialer=dialer)
 
     def send(self, message: Passing) -> None:
-        """As agents and master do: what has changed goes ahead."""
+        """Send changes first, as agents and master do."""
         if message.to.host is self:
             message.to.receive(message.token)
             return
@@ -98,7 +98,7 @@ class Process:
         raise AssertionError(reason)
 
     def receive(self, token: Token | None) -> None:
-        """Who gets a token finds in its memory what was written under it."""
+        """Check that the receiver of a token finds in its memory what was written under it."""
         if self.memory is None:
             self.waiting.append(token)
         elif token is not None:
@@ -108,7 +108,7 @@ class Process:
 
 
 class World:
-    """One run."""
+    """World of one run."""
 
     def __init__(self, seed: int) -> None:
         self.rng = rng = random.Random(seed)

@@ -1,4 +1,4 @@
-"""What must hold: compares what the user sees with what truly happened to each task.
+"""Promises of a pool: compares what the user sees with what truly happened to each task.
 
 The oracle knows what no executor can know: when each simulated worker began and ended each task.
 """
@@ -41,15 +41,15 @@ class Account:
         self.closed = False
         self.cancelled = False
         self.broken = False
-        """Its function does not unpickle."""
+        """True if the job's function does not unpickle."""
         self.refused = False
         """Not all of it could be asked for."""
         self.finished = False
         self.delivered = 0
-        """A bit for each task of which the user has heard."""
+        """Bits: one for each task whose result the user has got."""
         self.runs: dict[int, list[Worker]] = defaultdict(list)
         self.forgiven: dict[int, int] = defaultdict(int)
-        """Runs of a task that ended in an error which the pool was told to retry."""
+        """Runs of each task that ended in an error which the pool must retry."""
         self.charges: dict[int, int] = defaultdict(int)
         self.disruptions: dict[int, int] = defaultdict(int)
 
@@ -71,7 +71,7 @@ class Oracle:
 
     def begins(self, ref: Ref, worker: Worker) -> None:
         """``worker`` begins a task: the first time, or because an earlier run came to nothing."""
-        if ref == NO_OP or worker in self._lost:  # cut off: nobody can know, or tell it
+        if ref == NO_OP or worker in self._lost:  # cut off: the master cannot know its result
             return
         account = self.accounts[ref.job]
         runs = account.runs[ref.task]
@@ -87,7 +87,7 @@ class Oracle:
         runs.append(worker)
 
     def runs(self, ref: Ref) -> int:
-        """How often a task was begun."""
+        """Return how often a task was begun."""
         return 0 if ref == NO_OP else len(self.accounts[ref.job].runs[ref.task])
 
     def lost(self, worker: Worker) -> None:
@@ -101,7 +101,7 @@ class Oracle:
         if unread:
             raise Violation(f"{worker.name} is stopped with {unread} unread batches")
 
-    # What the user sees
+    # The user's view
 
     def fed(self, number: int, count: int) -> None:
         """The user gave ``count`` more tasks."""
@@ -113,7 +113,8 @@ class Oracle:
         bit = 1 << ref.task
         if account.delivered & bit:
             raise Violation(f"{ref} is delivered twice")
-        # What could not be sent never was part of the job: its caller hears that in any case.
+        # Calls that could not be sent never were part of the job: their caller gets an error in any
+        # case.
         if account.cancelled and outcome != "unsendable":
             raise Violation(f"{ref} is delivered, though its job was cancelled")
         if account.finished:
@@ -160,7 +161,7 @@ class Oracle:
             raise Violation(f"job {number} is finished before all of its tasks are")
         account.finished = True
 
-    # Who is to blame
+    # Blame
 
     def blamed(self, child: Child, seq: int, offset: int, ref: Ref, disrupted: bool) -> None:
         """A task is charged for the end of the worker that held it."""
@@ -172,14 +173,14 @@ class Oracle:
     def spared(self, child: Child, ref: Ref) -> None:
         """A task that a lost worker held is not charged."""
         if child.agent.lost and self.accounts[ref.job].plan.retries:
-            return  # nobody knows how far it was
+            return  # the worker's progress is unknown
         if child.worker.running == ref:
             raise Violation(f"{ref} is not blamed for the end of {child.name}, which was in it")
 
     @staticmethod
     def _is_suspect(worker: Worker, seq: int, offset: int) -> bool:
         if worker.has_lied:
-            return True  # what it has truly done was not heard
+            return True  # its true work was not reported
         if worker.work is None or worker.work.seq != seq:
             return False  # never read, or answered in full
         if worker.board is None or worker.board[0] != seq:
@@ -189,7 +190,7 @@ class Oracle:
     # At the end
 
     def check_end(self) -> None:
-        """Nothing happens any more."""
+        """Check the promises once no event is left."""
         for account in self.accounts:
             if not account.cancelled and not account.finished:
                 missing = account.everything & ~account.delivered

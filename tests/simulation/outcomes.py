@@ -1,4 +1,4 @@
-"""What the user of the real executor sees, told to the oracle."""
+"""Outcomes that the user of the real executor sees, reported to the oracle."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ if TYPE_CHECKING:
 
 
 HEARD = object()
-"""In place of an outcome that the oracle knows already."""
+"""Placeholder for an outcome that the oracle knows already."""
 
 
 class BrokenInput(Exception):
-    """What an iterable raises instead of its next item."""
+    """Error that an iterable raises instead of its next item."""
 
 
 class Outcomes:
-    """Where the executor puts the outcomes of one job, or of one call of it; a ``Future``."""
+    """Receiver of the outcomes of one job, or of one of its calls; a ``Future``."""
 
     def __init__(
         self,
@@ -45,7 +45,7 @@ class Outcomes:
         self._master = master
         self._oracle = master.world.oracle
         self._caller = caller
-        """Who waits for it."""
+        """Waiting actor, if any."""
         self._ended = False
 
     def add_results(self, start: int, outcomes: list[Any], mixed: bool, size: int = 0) -> bool:
@@ -96,14 +96,14 @@ class Outcomes:
             self._oracle.delivered(ref, Act.FINE)
 
     def set_done(self) -> None:
-        """That was all."""
+        """Note the end of the outcomes."""
         self._end()
         if self.call is None or self._master.ended_call(self.account):
             self._master.world.note("job %d is finished", self.account.number)
             self._oracle.finished(self.account.number)
 
     def set_exception(self, error: BaseException) -> None:
-        """There will be no more."""
+        """Note that no more outcomes will come, because of an error."""
         account, number = self.account, self.account.number
         if not self._master.world.loop.on_thread():
             raise Violation(f"job {number} hears on another thread than the loop's that it is over")
@@ -147,7 +147,7 @@ class Outcomes:
         return self._caller.get()
 
     def answered(self, outcome: Any) -> None:
-        """Its worker has told the caller itself."""
+        """Report that its worker has answered the caller itself."""
         self._put(Ref(self.account.number, self.call or 0), outcome)
         self._ended = True
         if self._master.ended_call(self.account):

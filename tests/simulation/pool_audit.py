@@ -1,4 +1,4 @@
-"""What must hold of a pool's executor and scheduler, looked at after every turn of the loop."""
+"""Invariants of a pool's executor and scheduler, checked after every turn of the loop."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class PoolAudit:
         self._workers = self._scheduler.workers
         self._check_ledger = check_ledger
         self.starved = False
-        """For long enough no worker has started."""
+        """True once no worker has started for long enough."""
         self.joined = False
         """The user waits for the pool's end, and takes no results."""
         self._moved = False
@@ -78,7 +78,7 @@ class PoolAudit:
         vars(self._workers)["news"] = self._news
         world.loop.after_turn = self._after_turn
 
-    # What it does
+    # Its actions
 
     def _decide(self, now: float) -> Decisions:
         require(self._world.loop.on_thread(), "the executor acts on another thread")
@@ -119,7 +119,7 @@ class PoolAudit:
         return losses
 
     def _fails_for_long(self, now: float, killed: bool, alone_since: float) -> bool:
-        """Whether workers have failed like the last one for as long as a pool bears it alone."""
+        """Return whether workers have failed like the last one for as long as a pool allows."""
         times = [time for time, other in self._failures if killed or not other]
         patience = KILLED_PATIENCE if killed else RAISED_PATIENCE
         return len(times) >= TRIES and now - max(times[0], alone_since) >= patience
@@ -207,15 +207,15 @@ class PoolAudit:
         return GRACE + (LAST_PAUSE_AT_WORK if at_work else LAST_PAUSE)
 
     def _is_short(self) -> bool:
-        """Whether there is work for more workers, and none are on their way."""
+        """Return whether there is work for more workers, and none are on their way."""
         workers = self._workers
         if self._scheduler.terminated or workers.error is not None or workers.starting:
             return False
-        # Nor does anybody come for what waits until results are read.
+        # Nor does a caller come for results that wait until earlier ones are read.
         tasks = sum(
             (job.reached if job.paused else job.fed) - job.done for job in self._ledger.jobs
         )
-        # A worker that still runs what was cancelled is not there for the others.
+        # A worker that still runs a cancelled task is not free for others.
         held_up = [it for it in self._ledger.workers if it.queue and not it.leaving]
         lost = sum(worker.queue[0].job is None for worker in held_up)
         wanted = max(tasks and tasks + lost, 0 if self._scheduler.closing else workers.minimum)
@@ -280,7 +280,7 @@ class PoolAudit:
         require(not any(left), "the pool leaves something behind")
 
     def check_rest(self) -> None:
-        """Nothing was to be done for long."""
+        """Check the pool after a long idle time."""
         workers = self._workers
         if self._world.has_links or workers.error is not None or workers._failures.pause:
             return

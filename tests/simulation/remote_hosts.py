@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class RemoteHost(Agent):
-    """A host with an agent of its own.  Once lost, it joins again under another name."""
+    """Host with a separate agent. Once lost, it joins again under another name."""
 
     def __init__(self, world: World, number: int, plan: schedule.Agent) -> None:
         super().__init__(world, number, SAME_HOST)
@@ -62,7 +62,7 @@ class RemoteHost(Agent):
 
     @property
     def is_cut(self) -> bool:
-        """Whether nothing gets through."""
+        """Return whether the way is closed."""
         return self._cable.is_cut
 
     def child_of_master(self, name: str, observer: ChildObserver) -> RemoteChild:
@@ -72,7 +72,7 @@ class RemoteHost(Agent):
         return RemoteChild(self._remote, spec, seen)
 
     def seen(self, name: str) -> Seen:
-        """What the master knows of a worker."""
+        """Return the master's knowledge of a worker."""
         return self._seen[name]
 
     def cut(self, seconds: float) -> None:
@@ -97,11 +97,11 @@ class RemoteHost(Agent):
         self.world.note("%s is given up: %s", self.host, reason)
         self.lost = True
         if not self.is_cut and not self.is_gone:
-            # What it started is ended by its own side; the backend starts an agent anew.
+            # Its own side ends its processes; the backend starts an agent anew.
             self.world.loop.call_later(0.0, self._join)
 
     def ended(self, child: Child) -> None:
-        """Its agent knows; the master does not yet."""
+        """Note an end that the agent knows and the master does not yet."""
         self._children.remove(child)
 
     def close(self) -> None:
@@ -143,23 +143,23 @@ class Seen:
         return self.child.worker
 
     def started(self, pid: int) -> None:
-        """It exists."""
+        """Note that the worker exists."""
         self._observer.started(pid)
 
     def received(self, message: Message) -> None:
-        """It said something."""
+        """Take a message of the worker."""
         self._observer.received(message)
 
     def recalled(self, seqs: list[int]) -> None:
-        """It did not read these."""
+        """Take back the packets that it did not read."""
         self._observer.recalled(seqs)
 
     def draining(self) -> None:
-        """Its host is about to go."""
+        """Note that its host is about to go."""
         self._observer.draining()
 
     def exited(self, report: ExitReport) -> None:
-        """It is gone."""
+        """Note the end of the worker."""
         self.gone = True
         world = self.agent.world
         world.note("the master hears that %s is gone: unread %s", self.name, report.unread)
@@ -169,7 +169,7 @@ class Seen:
 
 
 class NoCapture(SimpleNamespace):
-    """In place of the pipe that reads a child's output."""
+    """Stand-in for the pipe that reads a child's output."""
 
     stdio = (1, 2)
 
@@ -177,8 +177,8 @@ class NoCapture(SimpleNamespace):
         super().__init__()
 
     def started(self) -> None:
-        """It has its own descriptors."""
+        """Do nothing: the pipe has its own descriptors."""
 
     def finish(self) -> tuple[str, ...]:
-        """It wrote nothing."""
+        """Return no output."""
         return ()

@@ -1,4 +1,4 @@
-"""What happens in one simulated run: drawn from a seed, made smaller when it fails."""
+"""Events of one simulated run: drawn from a seed, made smaller when it fails."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ FOREVER = float("inf")
 
 
 class Act(enum.Enum):
-    """How a task ends."""
+    """End of a task."""
 
     FINE = enum.auto()
     RAISES = enum.auto()
@@ -25,13 +25,13 @@ class Act(enum.Enum):
     UNREADABLE = enum.auto()
     """No worker can unpickle it."""
     UNSENDABLE = enum.auto()
-    """It does not even pickle."""
+    """Task that does not even pickle."""
     ENDLESS = enum.auto()
 
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """One task."""
+    """Plan of one task."""
 
     seconds: float
     act: Act = Act.FINE
@@ -40,7 +40,7 @@ class Task:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """One call of the pool's user."""
+    """Call of the pool's user."""
 
     at: float
     tasks: tuple[Task, ...]
@@ -53,13 +53,13 @@ class Job:
     alone: bool = False
     timeout: float | None = None
     everywhere: bool = False
-    """Its first task is pinned to every worker there is."""
+    """True if its first task is pinned to every existing worker."""
     cancelled_at: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Agent:
-    """One host.  ``delay`` and ``jitter``, one way, in seconds: none on the master's own."""
+    """Host. ``delay`` and ``jitter``, one way, in seconds: none on the master's own."""
 
     delay: float = 0.0
     jitter: float = 0.0
@@ -107,7 +107,7 @@ class Slow:
 
 @dataclass(frozen=True, slots=True)
 class Cut:
-    """Nothing reaches or leaves an agent for ``seconds``; FOREVER: its host is gone."""
+    """Cut of an agent from the network for ``seconds``; FOREVER: its host is gone."""
 
     agent: int
     at: float
@@ -139,12 +139,12 @@ class Refusal:
 
 @dataclass(frozen=True, slots=True)
 class Famine:
-    """For a while no worker gets as far as being ready."""
+    """Time in which no worker becomes ready."""
 
     at: float
     seconds: float
     exitcode: int
-    """How they die; REFUSED: the system starts none."""
+    """Exit code of the workers; REFUSED: the system starts none."""
 
     REFUSED: ClassVar[int] = 0
 

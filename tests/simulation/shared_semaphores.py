@@ -20,7 +20,7 @@ from fiber._sync.semaphore import SharedSemaphore
 
 SLOTS = range(32, 32 + 8 * 8, 8)
 STEPS = 9_000
-"""Of a schedule; one that takes more hangs."""
+"""Steps of a schedule; one that takes more hangs."""
 
 
 class Killed(BaseException):
@@ -37,7 +37,7 @@ class Process:
         self.stores: list[tuple[int, bytes]] = []
         self.interrupted = False
         self.sleeps = 0
-        """For how many turns the kernel lets others run."""
+        """Number of turns for which the kernel lets others run."""
         self.error: BaseException | None = None
         self._world = world
         self._turn = threading.Lock()
@@ -67,7 +67,7 @@ class Process:
             self._thread.join()
 
     def step(self) -> None:
-        """In its thread: others may go on before what follows."""
+        """Pause this process's thread: others may run before the next step."""
         self._back.release()
         self._turn.acquire()
         if not self.alive:
@@ -117,10 +117,10 @@ class World:
     def _put(self, start: int, data: bytes) -> None:
         self._memory[start : start + len(data)] = data
 
-    # In place of what the code uses
+    # Stand-ins for what the code uses
 
     def sleep(self, seconds: float) -> None:
-        """What was stored before is seen by all."""
+        """Make all earlier stores visible to all."""
         self.current.step()
         for process in self.processes:
             self.empty(process)
@@ -136,7 +136,7 @@ class World:
         return self.current.number + 1
 
     def is_alive(self, who: int) -> bool:
-        """As the kernel knows it."""
+        """Return whether the process lives, as the kernel knows it."""
         self.current.step()
         return self.processes[who - 1].alive
 
@@ -162,7 +162,7 @@ class World:
     # The schedule
 
     def start(self, action: Callable[[Process], None]) -> Process:
-        """One more process."""
+        """Add a process."""
         process = Process(self, len(self.processes), action)
         self.processes.append(process)
         return process
@@ -184,7 +184,7 @@ class World:
         raise AssertionError("somebody waits for ever")
 
     def move(self, processes: Sequence[Process]) -> None:
-        """One step of one of them, or one store of anybody's becomes seen."""
+        """Take one step of a process, or make one store visible."""
         process = self.random.choice(processes)
         if self.random.random() < 0.02:
             process.sleeps = 40
@@ -282,7 +282,7 @@ class Bytes:
         self._world = world
 
     def cast(self, _: str) -> Words:
-        """As words."""
+        """Return a view of the memory as words."""
         return Words(self._world)
 
     def __getitem__(self, key: Any) -> Any:

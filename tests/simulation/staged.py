@@ -1,4 +1,4 @@
-"""What the real executor finds in place of threads, processes and the runtime.
+"""Stand-ins for the threads, processes and runtime of the real executor.
 
 One thread runs at a time, so that a seed decides the order.  What the executor does on its
 background threads, and its callers on theirs, happens at moments that the seed chooses, and may be
@@ -77,7 +77,7 @@ class Stage:
         self.world.note("the user is told: %s", news)
 
     def thread(self, name: str) -> StagedThread:
-        """In place of a BackgroundThread; sometimes one that may be interrupted, which is slow."""
+        """Return a stand-in for a BackgroundThread, sometimes one that may be interrupted."""
         return InterruptedThread(self, name) if self._interrupts else StagedThread(self, name)
 
     def act(self, name: str, body: Callable[[Actor], None]) -> Actor:
@@ -126,7 +126,7 @@ class Stage:
         owner.exited(ExitReport(UNKNOWN, f"could not be started: {error}", cause=Cause.REFUSED))
 
     def run_user_code(self) -> None:
-        """What every piece of the user's code does."""
+        """Take the time of a piece of the user's code, which may raise."""
         self.user_code_on_loop |= self.loop.on_thread()
         self.pause()
 
@@ -186,7 +186,7 @@ class Actor:
 
     @property
     def starves(self) -> bool:
-        """Whether it waits for an entry, and none is there."""
+        """Return whether it waits for an entry, and none is there."""
         return self._waits and not self._entries
 
     def start(self) -> None:
@@ -215,12 +215,12 @@ class Actor:
             self._thread.join()
 
     def sleep(self, seconds: float) -> None:
-        """In the actor: let time pass."""
+        """Pause the actor: let time pass."""
         self._stage.loop.call_later(seconds, self.resume)
         self._pause()
 
     def wait(self, seconds: float) -> None:
-        """In the actor: let time pass until somebody wakes it."""
+        """Pause the actor until another one wakes it."""
         self._alarm = self._stage.loop.call_later(seconds, self._wake_up)
         self._pause()
 
@@ -237,7 +237,7 @@ class Actor:
     # As the queue that a thread waits at
 
     def get(self, timeout: float = math.inf) -> Any:
-        """In the actor: the next entry, once there is one, however long that takes."""
+        """Pause the actor until the next entry, and return it."""
         while not self._entries:
             self._waits = True
             self._pause()
@@ -271,7 +271,7 @@ class Actor:
 
 
 class StagedLatch:
-    """In place of a ``Latch`` that one actor waits at."""
+    """Stand-in for a ``Latch`` that one actor waits at."""
 
     def __init__(self, stage: Stage) -> None:
         self._stage = stage
@@ -279,13 +279,13 @@ class StagedLatch:
         self._waiting: Actor | None = None
 
     def set(self) -> None:
-        """It happens now."""
+        """Set the latch."""
         self._set = True
         if self._waiting is not None:
             self._waiting.wake()
 
     def wait(self, timeout: float) -> bool:
-        """In the actor: wait for it."""
+        """Pause the actor until the latch is set."""
         if not self._set:
             assert self._stage.running is not None
             self._waiting = self._stage.running
@@ -294,7 +294,7 @@ class StagedLatch:
 
 
 class StagedThread:
-    """In place of a ``BackgroundThread``: does each thing at once, when its turn has come."""
+    """Stand-in for a ``BackgroundThread``: runs each piece of work at once, in its turn."""
 
     def __init__(self, stage: Stage, name: str) -> None:
         self._stage = stage
@@ -309,7 +309,7 @@ class StagedThread:
         return not self.stopped
 
     def stop(self, then: Callable[[], object] | None = None) -> None:
-        """Take nothing more, and call ``then`` at the end."""
+        """Take no more work, and call ``then`` at the end."""
         self.stopped = True
         if then is not None:
             self._put(then)
@@ -324,7 +324,7 @@ class StagedThread:
 
 
 class InterruptedThread(StagedThread):
-    """Another one, which may pause within what it does."""
+    """Thread that may pause within its work."""
 
     def __init__(self, stage: Stage, name: str) -> None:
         super().__init__(stage, name)
@@ -383,7 +383,7 @@ class StagedChannel:
         return None
 
     def close(self) -> None:
-        """Nobody uses it any more."""
+        """Do nothing: the channel has no resources."""
 
     def hear(self, message: Any) -> None:
         """The worker sent it."""
@@ -392,7 +392,7 @@ class StagedChannel:
             self._reader.wake()
 
     def drain(self) -> list[Any]:
-        """What nobody has received."""
+        """Return the packets that were not received."""
         left = list(self._received)
         self._received.clear()
         return left

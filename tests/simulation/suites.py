@@ -1,4 +1,4 @@
-"""What is driven through the schedules, by name."""
+"""Objects that the schedules drive, by name."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ import pytest
 from fiber._engine.placement import Demand, Placement
 
 RELEASES = 1000
-"""In each run; so many scale-downs while other agents are at work."""
+"""Number of scale-downs in each run, while other agents are at work."""
 
 IDLE = 1.0
 

@@ -25,7 +25,7 @@ def test_it_keeps_them_over_real_links_to_real_agent_services(part: int) -> None
 
 @pytest.mark.parametrize("seed", range(10))
 def test_what_a_leased_worker_answers_before_it_dies_counts(seed: int) -> None:
-    """Its caller may not have looked yet; then the call must not run again."""
+    """Recall a call before its caller has looked; then it must not run again."""
     job = Job(0.0, (Task(1e-4),) * 12, bite=3000, pause=0.0, retries=1)
     for at in range(5, 25):
         schedule = Schedule(seed, (job,), faults=(Kill(0, at * 1e-3),))

@@ -31,7 +31,7 @@ RARE = {
     "leases_what_is_needed": 600,
     "blames_what_was_dropped": 10_000,
 }
-"""Where the search begins for those that show late; it goes on with all the others."""
+"""Seeds where the search begins for faults that show late; it goes on with all the others."""
 
 Patch = pytest.MonkeyPatch
 Fault = Callable[[Patch], None]
@@ -78,7 +78,7 @@ def grows_too_far(patch: Patch) -> None:
 
 
 def never_looks_again(patch: Patch) -> None:
-    """Who was idle for long stays, what could be recalled later is not, no pause ever ends."""
+    """Ignore timers: idle workers stay, recalls wait, and pauses never end."""
     decides(patch, lambda _, decisions: decisions._replace(wake_at=float("inf")))
 
 
@@ -90,7 +90,7 @@ def forgets_that_somebody_left(patch: Patch) -> None:
 
 
 def gives_up_at_once(patch: Patch) -> None:
-    """As if not the time decided, but the number."""
+    """Decide by the number instead of the time."""
     patch.setattr(start_failures, "RAISED_PATIENCE", 0.0)
     patch.setattr(start_failures, "KILLED_PATIENCE", 0.0)
 

@@ -17,7 +17,7 @@ KINDS = {"lock": (1, 1), "bounded": (2, 2), "semaphore": (2, SEM_VALUE_MAX)}
 
 
 def takes_turns(world: World, make: Callable[[], SharedSemaphore]) -> Callable[[Process], None]:
-    """What each process does."""
+    """Return the program of each process."""
 
     def action(process: Process) -> None:
         semaphore = make()
@@ -35,7 +35,7 @@ def takes_turns(world: World, make: Callable[[], SharedSemaphore]) -> Callable[[
 
 
 def run(seed: int, tokens: int, maximum: int) -> None:
-    """One schedule."""
+    """Run one schedule."""
     world = World(seed, tokens, maximum)
     with pytest.MonkeyPatch.context() as patch:
         make = simulated(world, patch)

@@ -45,7 +45,7 @@ def every_third(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _apply_all(twin: Any, runs: Any) -> None:
-    """Forgets what was changed here and is yet to be sent."""
+    """Apply patches, but forget the local changes that are yet to be sent."""
     for start, data in runs:
         twin._memory[start : start + len(data)] = data
         twin._agreed[start : start + len(data)] = data

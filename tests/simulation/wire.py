@@ -14,7 +14,7 @@ from simulation.workers import NO_OP, Broken, Ready, Ref, Results, Unknown, Unre
 
 
 class PlannedError(ValueError):
-    """What tasks raise; unpickling it is the user's code."""
+    """Error that tasks raise; unpickling it runs the user's code."""
 
     unpickled: Callable[[], None] = staticmethod(lambda: None)
     """Called by that."""
@@ -61,7 +61,7 @@ class Wire:
     def work(
         self, worker: Worker, seq: int, payload: bytes, buffers: Sequence[memoryview]
     ) -> Work | Unknown | Broken | None:
-        """What a packet says."""
+        """Return the content of a packet."""
         head = work.Head._make(work.HEAD.unpack_from(payload))
         body = memoryview(payload)[work.HEAD.size :]
         if head.kind == work.STOP:
@@ -88,7 +88,7 @@ class Wire:
         return Work(seq, [Ref(*item) for item in items], head.stride or 1, head.unit)
 
     def message(self, said: Any) -> Message:
-        """What a worker says."""
+        """Return the message of a worker."""
         words: tuple[Any, ...]
         if isinstance(said, Ready):
             words = (work.READY,)

@@ -79,13 +79,13 @@ class Ready(NamedTuple):
 
 
 class Worker:
-    """What the operating system would call the process."""
+    """Worker of a pool, as a simulated process."""
 
     def __init__(self, world: World, number: int, child: Child) -> None:
         self.name = child.name
         self.number = number
         self.functions: set[int] = set()
-        """Those that it remembers."""
+        """Functions that it remembers."""
         self.born = False
         self.dead = False
         self.board: tuple[int, int] | None = None
@@ -111,7 +111,7 @@ class Worker:
         self._slowness = max((f.factor for f in faults if isinstance(f, Slow)), default=1.0)
         self._still_born = any(isinstance(fault, StillBirth) for fault in faults)
 
-    # Life
+    # Start and end
 
     def be_born(self) -> None:
         """Start up."""
@@ -129,7 +129,7 @@ class Worker:
             self.wake()
 
     def wake(self) -> None:
-        """There may be something to read."""
+        """Read if a packet may be there."""
         if self._awake and not self.dead and self._child.inbox:
             self._awake = False
             self._later(self._rng.random() * MOMENT, self._read)

@@ -1,4 +1,4 @@
-"""One simulated run: time, hosts, workers, and the master that gives them work."""
+"""Simulated run: time, hosts, workers, and the master that gives them work."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ MOMENTS = 1e-5, 1e-4, 3e-3
 """Seconds until another thread gets its turn, at most: on an idle machine, on a busy one."""
 
 INSTANT = 1e-9
-"""Seconds between two things one of which must come first."""
+"""Seconds between two events one of which must come first."""
 
 END = 1e6
-"""Simulated seconds after which nothing can be left to happen."""
+"""Simulated seconds after which no event can be left."""
 
 
 class Loop(SimulatedLoop):
@@ -70,15 +70,15 @@ class Loop(SimulatedLoop):
         self._heard_at: dict[str, float] = {}
 
     def depend(self, dependent: object) -> None:
-        """This one never fails."""
+        """Do nothing: this loop never fails."""
 
     def on_thread(self) -> bool:
-        """Whether the caller may take this for the loop's thread."""
+        """Return whether the caller may take this for the loop's thread."""
         return self._thread is None
 
     @contextmanager
     def off_thread(self, name: str) -> Iterator[None]:
-        """What happens within happens on the thread of this name."""
+        """Run the block on the thread of this name."""
         before, self._thread = self._thread, name
         try:
             yield
@@ -90,11 +90,11 @@ class Loop(SimulatedLoop):
         return self._rng.random() * self._longest
 
     def heard_in(self, thread: str) -> float:
-        """Seconds until the loop has heard all that ``thread`` has asked for."""
+        """Return the seconds until the loop has received all that ``thread`` has asked for."""
         return max(0.0, self._heard_at.get(thread, 0.0) - self._now)
 
     def comes_after(self, thread: str, earlier: str) -> None:
-        """What ``thread`` asks for comes after all that ``earlier`` has asked for until now."""
+        """Order the requests of ``thread`` after all earlier requests of ``earlier``."""
         heard_at = self._heard_at.get(earlier, 0.0), self._heard_at.get(thread, 0.0)
         self._heard_at[thread] = max(heard_at) + INSTANT
 
@@ -126,15 +126,15 @@ class Loop(SimulatedLoop):
 
 
 class Language(Protocol):
-    """How the giver of work and its workers write down what they say."""
+    """Format of the messages between master and workers."""
 
     def work(
         self, worker: Worker, seq: int, payload: Any, buffers: Sequence[memoryview]
     ) -> Work | Unknown | Broken | None:
-        """What a delivered packet says, or what ``worker`` says to it; None: stop."""
+        """Return the content of a delivered packet, or of a message to ``worker``; None: stop."""
 
     def message(self, said: Any) -> Any:
-        """What a worker says, as its observer gets it."""
+        """Return a worker's message, as its observer gets it."""
 
 
 class Master(Protocol):
@@ -142,7 +142,7 @@ class Master(Protocol):
 
     @property
     def language(self) -> Language:
-        """How it speaks with its workers."""
+        """Format of the messages to and from its workers."""
 
     def begin(self) -> None:
         """Set the schedule's jobs and workers going."""
@@ -157,13 +157,13 @@ class Master(Protocol):
         """Cancel all jobs."""
 
     def check_end(self) -> None:
-        """Everything has happened: nothing may be left over."""
+        """Check that no work is left over after the last event."""
 
     def done(self) -> bool:
-        """Whether nothing is left to happen but heartbeats."""
+        """Return whether only heartbeats are left to happen."""
 
     def leave_process(self) -> None:
-        """Undo what it did to the process."""
+        """Undo its changes of the process."""
 
 
 class World:
@@ -209,7 +209,7 @@ class World:
 
     @property
     def has_links(self) -> bool:
-        """Whether there are links, whose heartbeats never end."""
+        """Return whether there are links, whose heartbeats never end."""
         return any(isinstance(agent, RemoteHost) for agent in self.agents)
 
     def run_out(self) -> None:
@@ -220,7 +220,7 @@ class World:
         end = self.loop.now() + PATIENCE
         while not self._master.done() and self.loop.now() < end:
             self.loop.run_for(5)
-        self.loop.run_for(2 * LOST_AFTER)  # what is out of reach notices that, too
+        self.loop.run_for(2 * LOST_AFTER)  # processes out of reach notice it, too
 
     def note(self, text: str, *args: object) -> None:
         """Write it into the trace, if there is one."""
@@ -245,11 +245,11 @@ class World:
         return len(self.workers)
 
     def faults_of(self, worker: int) -> list[Fault]:
-        """What happens to a worker as it goes on."""
+        """Return the faults of a worker during its work."""
         return self._faults.get(worker, [])
 
     def famine(self) -> int | None:
-        """How all workers die that start now, if they do."""
+        """Return the exit code with which all workers that start now die, if they do."""
         now = self.loop.now()
         for fault in self.schedule.faults:
             if isinstance(fault, Famine) and fault.at <= now < fault.at + fault.seconds:
@@ -257,7 +257,7 @@ class World:
         return None
 
     def task(self, ref: Ref) -> Task:
-        """What a task does."""
+        """Return the plan of a task."""
         if ref == NO_OP:
             return Task(0.0)
         job = self.schedule.jobs[ref.job]

@@ -26,7 +26,7 @@ class _Anything(metaclass=_AnyName):
         pass
 
     def __call__(self, decorated: Any) -> Any:
-        """As a decorator it does nothing."""
+        """Do nothing, as a decorator."""
         return decorated
 
 
@@ -56,7 +56,7 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
 
 def stand_in(package: str) -> Callable[[str], Any]:
-    """What a module needs to stand in for a package: its ``__getattr__``."""
+    """Return the ``__getattr__`` with which a module stands in for a package."""
     sys.meta_path.append(_Finder(package))
     return attribute
 

@@ -1,4 +1,4 @@
-"""In place of torch, which stable-baselines3 imports and its vector environments do not use."""
+"""Stand-in for torch, which stable-baselines3 imports and its vector environments do not use."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the children in test_agent.py run, and who observes them."""
+"""Functions of the children in test_agent.py, and their observers."""
 
 from __future__ import annotations
 

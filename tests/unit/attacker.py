@@ -1,4 +1,4 @@
-"""Somebody on the path between an agent and its master, who sees and forwards each byte.
+"""Attacker on the path between an agent and its master, who sees and forwards each byte.
 
 There is no network: the agent's end and the master's are sockets that were made by hand, as a relay
 would have them.
@@ -17,7 +17,7 @@ from fiber._transport.listener import MasterListener
 TLS, GREETING, MESSAGE = "tls", "greeting", "message"
 UP, DOWN = "up", "down"
 CUT = None
-"""In place of a unit: the connection ends here."""
+"""Marker in place of a unit: the connection ends here."""
 
 _RECORD = struct.Struct(">BHH")
 _LENGTH = struct.Struct(">Q")
@@ -49,7 +49,7 @@ class Path:
         self.connections = 0
 
     def connect(self, _address: str) -> socket.socket:
-        """What an agent uses in place of dialling."""
+        """Connect, as an agent uses it in place of dialling."""
         agent, agents = socket.socketpair()
         master, masters = socket.socketpair()
         self._listener.take(master, f"the path, {self.connections}")

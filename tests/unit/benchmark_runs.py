@@ -1,4 +1,4 @@
-"""Where and how a run of the benchmarks was made, as the tests of their pages have it."""
+"""Place and time of a run of the benchmarks, for the tests of their pages."""
 
 from __future__ import annotations
 
@@ -21,5 +21,5 @@ _ABOUT = {
 
 
 def about(**differently: Any) -> dict[str, Any]:
-    """What ``Run.about`` has."""
+    """Return the fields of ``Run.about``."""
     return {**_ABOUT, **differently}

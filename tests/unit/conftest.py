@@ -1,4 +1,4 @@
-"""What several modules test with: a loop, the ends of links, two hosts in one process."""
+"""Fixtures of several modules: a loop, the ends of links, two hosts in one process."""
 
 from __future__ import annotations
 

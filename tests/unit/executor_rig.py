@@ -61,7 +61,7 @@ class ManualLoop:
 
     @property
     def timers(self) -> list[LoopTimer]:
-        """Those that are to fire."""
+        """Return the timers that are to fire."""
         return [timer for timer in self._timers if timer.callback is not None]
 
     def pass_time(self, seconds: float) -> None:
@@ -90,7 +90,7 @@ class ManualThread:
         self.submitted: list[tuple[Callable[..., object], tuple[Any, ...]]] = []
         self.stopped = False
         self.refusal: RuntimeError | None = None
-        """What stands in the way of the thread."""
+        """Error with which the thread fails."""
 
     def submit(self, action: Callable[..., object], *args: Any) -> bool:
         if self.refusal is not None:
@@ -131,7 +131,7 @@ class FakeChild:
         self.gone = False
 
     def start(self) -> None:
-        """It does what the test says."""
+        """Do nothing: the test decides what the worker does."""
 
     def deliver(self, seq: int, payload: bytes, buffers: Sequence[memoryview] = ()) -> bool:
         if not self.gone:
@@ -145,10 +145,10 @@ class FakeChild:
         self.signals.append(signum)
 
     def lend(self) -> None:
-        """Nobody uses it directly."""
+        """Do nothing: no caller uses it directly."""
 
     def reclaim(self) -> None:
-        """It is never lent."""
+        """Do nothing: no worker is leased."""
 
     @property
     def told_to_end(self) -> bool:
@@ -171,7 +171,7 @@ class Results:
         return True
 
     def lift_bound(self) -> None:
-        """There is none."""
+        """Do nothing: there is no bound."""
 
     def set_done(self) -> None:
         self.done += 1
@@ -191,7 +191,7 @@ class Rig:
         self.children: list[FakeChild] = []
         self.handles: list[WorkerHandle] = []
         self.refusal: BaseException | None = None
-        """What stands in the way of another worker."""
+        """Error that prevents another worker."""
         host: Any = SimpleNamespace(
             loop=self.loop,
             start=self._start,
@@ -263,7 +263,7 @@ class Rig:
         handle.received(Message(memoryview(pickle.dumps(words)), [], []))
 
     def all_ready(self) -> None:
-        """Those that are not say that they are."""
+        """Have the others say that they are ready."""
         for handle in self.handles:
             if handle.worker is None and handle in self.members:
                 self.say(handle, work.READY)
@@ -287,7 +287,7 @@ class Rig:
     def lose(self, handle: WorkerHandle, **report: Any) -> None:
         handle.exited(ExitReport(-9, "killed by SIGKILL", host="here", **report))
 
-    # What is asked for
+    # Requests
 
     def call(self, *args: Any, function: Any = tasks.square, **options: Any) -> Results:
         results = Results()
@@ -304,7 +304,7 @@ class Rig:
         self.executor.submit(self.item(results, **options), items)
         return results
 
-    # What was sent
+    # Sent packets
 
     def child(self, handle: WorkerHandle) -> FakeChild:
         assert isinstance(handle.child, FakeChild)

@@ -100,7 +100,7 @@ class Told:
             self._changed.notify_all()
 
     def wait(self, what: Callable[[], object], timeout: float = PATIENCE) -> None:
-        """Until it is so; it is asked after each thing that is told."""
+        """Wait until the condition holds; check it after each notice."""
         with self._changed:
             assert self._changed.wait_for(what, timeout), self
 
@@ -167,7 +167,7 @@ class Rig:
         return self.get(names.PLURAL, name)
 
     def spec(self, name: str = "es-1") -> Body:
-        """Its spec, empty while there is none."""
+        """Return its spec, empty if there is no pool."""
         pools = self.server.objects(names.PLURAL)
         return next((pool["spec"] for pool in pools if pool["metadata"]["name"] == name), {})
 
@@ -199,7 +199,7 @@ class Rig:
 
 @contextlib.contextmanager
 def rig(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
-    """One that ends with the test."""
+    """Yield a rig that ends with the test."""
     with served() as server:
         monkeypatch.setenv("KUBECONFIG", str(kubeconfig(folder, server.api.url)))
         loop = Loop()

@@ -23,8 +23,8 @@ from fiber._transport.listener import MasterListener
 from fiber._transport.loop import Loop
 from patience import PATIENCE
 
-# Once used, nng keeps threads and two descriptors for as long as the process lives.  The census of
-# what tests leave behind begins after the collection, and so after this.
+# Once used, nng keeps threads and two descriptors for as long as the process runs. The census of
+# leaks begins after the collection, and so after this.
 pynng.Pair1().close()
 
 T = TypeVar("T")
@@ -203,14 +203,14 @@ def break_connections(listener: MasterListener) -> None:
 
 
 def vanish(listener: MasterListener) -> None:
-    """As a killed process would."""
+    """End as a killed process would."""
     for wire in wires_of(listener):
         wire.close()
     listener._acceptor.close()
 
 
 def say(address: str, credentials: Credentials, words: bytes) -> bytes:
-    """What a master answers to the first words of somebody with the right credentials."""
+    """Return a master's answer to the first message of a client with the right credentials."""
     sock = socket.create_connection(("127.0.0.1", port_of(address)))
     handshake = authentication.AgentHandshake(sock, authentication.agent_context())
     try:

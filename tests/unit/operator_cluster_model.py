@@ -37,7 +37,7 @@ def view(number: int, state: PodState, **fields: Any) -> PodView:
 
 @dataclass
 class Model:
-    """One pool and its pods.  Time passes in ``pass_time`` alone."""
+    """Model of one pool and its pods. Time passes in ``pass_time`` alone."""
 
     document: dict[str, Any] = field(default_factory=pool_document)
     pods: dict[str, PodView] = field(default_factory=dict)
@@ -91,7 +91,7 @@ class Model:
         self.created += made.create
 
     def act(self) -> Plan:
-        """One reconcile, whole."""
+        """Run one whole reconcile."""
         made = self.plan()
         self.write_status(made)
         self.delete(made)
@@ -99,7 +99,7 @@ class Model:
         return made
 
     def restart(self) -> None:
-        """The operator loses what it remembers."""
+        """Forget the operator's memory."""
         self.knowledge = Knowledge(address=ADDRESS)
 
     def evict(self, number: int) -> bool:
@@ -152,7 +152,7 @@ class Model:
         return replace(pod, state=PodState.READY, since=self.now, was_ready=True, trouble=None)
 
     def release_what_the_operator_may_not_take(self) -> None:
-        """What the SDK does with idle workers: outdated ones and those that are too many."""
+        """Release outdated and surplus idle workers, as the SDK does."""
         spec, hash_ = self.document["spec"], template_hash(self.pool)
         ready = [pod for pod in self.live if pod.was_ready]
         outdated = [pod.name for pod in ready if pod.template_hash != hash_]

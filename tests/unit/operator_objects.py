@@ -155,7 +155,7 @@ def of_template(hash_: str, document: Json) -> Json:
 
 
 def views(pool: FiberPool, *documents: Json) -> list[PodView]:
-    """What the operator sees; pods without a template are of the pool's."""
+    """Return the operator's view; pods without a template have the pool's."""
     current = template_hash(pool)
     return [
         observe(
@@ -169,7 +169,7 @@ def views(pool: FiberPool, *documents: Json) -> list[PodView]:
 
 
 def plan_of(pool: FiberPool, *pods: Json, now: float = NOW, **knowledge: Any) -> Plan:
-    """What is planned for the pool with these pods; further arguments are the operator's memory."""
+    """Return the plan for the pool with these pods; further arguments are the operator's memory."""
     return plan(pool, views(pool, *pods), knowledge_of(pool, **knowledge), now)
 
 

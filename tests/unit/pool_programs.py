@@ -1,4 +1,4 @@
-"""Programs that use a pool, and waiting for what becomes of it."""
+"""Programs that use a pool, and waiting for their results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the tests of the pool have their workers run, and what they send there."""
+"""Functions that the workers of the pool's tests run, and objects that they send."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def nap_and_return(x: int) -> int:
 
 
 def gather(iterator: Iterator[Any]) -> list[Any]:
-    """For tests: all results, errors in their places."""
+    """Return all results, with errors in their places."""
     found: list[Any] = []
     while True:
         try:
@@ -109,7 +109,7 @@ def announce_and_sleep(path: Path) -> None:
 
 
 def wait_if_first(task: tuple[int, Path]) -> int:
-    """Task 0 waits for what only somebody who has the other tasks' results can do."""
+    """Wait, as task 0, for an action that needs the other tasks' results."""
     index, gate = task
     if index == 0:
         wait_for(gate)
@@ -117,7 +117,7 @@ def wait_if_first(task: tuple[int, Path]) -> int:
 
 
 def count(path: Path) -> int:
-    """One more line in the file: how often something ran."""
+    """Append a line to the file, which counts calls."""
     with path.open("a") as file:
         file.write("x\n")
     return len(path.read_text().splitlines())
@@ -319,7 +319,7 @@ def raise_exotic(_: object = None) -> NoReturn:
 
 
 def odd_results(x: int) -> object:
-    """Of five results one does not pickle and one does not unpickle in the program."""
+    """Return a result; one of five does not pickle, and one does not unpickle in the program."""
     if x % 5 == 2:
         return Unpicklable()
     if x % 5 == 3:

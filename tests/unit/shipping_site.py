@@ -17,7 +17,7 @@ NOWHERE = ProgramPaths((), (), "", None)
 
 
 def layout(*folders: Path, program: Path | None = None, files: tuple[Path, ...] = ()) -> Layout:
-    """Of a program that has these folders."""
+    """Return the layout of a program that has these folders."""
     places = Places({str(folder): folder.name for folder in folders})
     return Layout(
         places, str(program or folders[0]), tuple(map(str, files)), (), frozenset(), NOWHERE
@@ -25,7 +25,7 @@ def layout(*folders: Path, program: Path | None = None, files: tuple[Path, ...] 
 
 
 def files(*folders: Path, **options: Any) -> dict[str, FileEntry]:
-    """What is sent of them."""
+    """Return the files of them that are sent."""
     return select(layout(*folders, **options)).files
 
 
@@ -36,8 +36,8 @@ def packed(*folders: Path, **options: Any) -> bytes:
 
 
 def unpacked(archive: bytes, target: Path) -> Path:
-    """``target``, with what is in the archive."""
-    blob = Blob(archive)  # whose descriptor lives as long as it does
+    """Unpack the archive into ``target``."""
+    blob = Blob(archive)  # it keeps its descriptor open
     unpack(blob.fileno(), str(target))
     return target
 

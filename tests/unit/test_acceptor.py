@@ -1,4 +1,4 @@
-"""The acceptor: who is turned away there, when, and what is said of it."""
+"""Rejections of the acceptor: which client is rejected, when, and with which message."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class Visitor:
-    """Goes as far as told, with an agent's credentials."""
+    """Client with an agent's credentials that stops where the test says."""
 
     def __init__(self, site: Site, address: str) -> None:
         self._credentials = site.credentials.agent("stranger", "")
@@ -94,7 +94,7 @@ def test_who_stops_in_the_middle_is_turned_away_in_time_and_told_once(
     for visitor in visitors:
         visitor.go(state)
     _, agent = site.dialer(listener.address)
-    assert agent.link is not master.link  # they hold up nobody
+    assert agent.link is not master.link  # they delay no other client
     pass_time(listener, PATIENCE)
     for visitor in visitors:
         visitor.rest()

@@ -1,4 +1,4 @@
-"""Who may wait at the door."""
+"""Admission of connections that wait."""
 
 from __future__ import annotations
 

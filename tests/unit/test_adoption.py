@@ -1,4 +1,4 @@
-"""adopt(): one module on Fiber, everything or nothing, and back again."""
+"""Adoption of modules by adopt(): all names or none, and back again."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def get_context(method: str) -> Context:
 
 @pytest.fixture
 def fiber() -> ModuleType:
-    """What `import fiber` gives, as far as these tests need it."""
+    """Return the names that `import fiber` gives, as far as these tests need them."""
     package = ModuleType("fiber")
     vars(package).update(
         Process=Process,

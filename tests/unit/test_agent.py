@@ -1,4 +1,4 @@
-"""The agent on real processes: what it starts, what it hears, how it ends."""
+"""Agent on real processes: it starts them, gets their messages, and ends."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def settled(loop: Loop) -> None:
 
 
 def specification(target: Callable[..., Any], *args: Any, **options: Any) -> ChildSpec:
-    """What the runtime asks of an agent for one process."""
+    """Return the runtime's specification of one process for an agent."""
     process = Process(target=target, args=args)
     preparation = spawn.get_preparation_data(process.name)
     preparation |= {"authkey": bytes(preparation["authkey"]), "calls": []}
@@ -178,7 +178,7 @@ def test_one_that_was_killed_before_it_was_born_is_gone_at_once(own: Agent, tmp_
     assert report.reason == "killed by SIGKILL"
     assert child.pid is None
     os.close(writer)
-    # The zygote goes on, and the next child is not given what was its.
+    # The zygote goes on, and does not pass the dead child's state to the next one.
     other, second = begin(own, run_forever, tasks=True)
     end(other, second)
 
@@ -221,7 +221,7 @@ def test_descriptors_travel_however_many_and_none_stays(shared: Agent) -> None:
     before = len(os.listdir("/proc/self/fd"))
     pipes = [os.pipe() for _ in range(300)]
     fds = tuple(descriptor.own(writer) for _, writer in pipes)
-    handles = [Handle(index) for index in range(200)]  # a hundred are taken by nobody
+    handles = [Handle(index) for index in range(200)]  # a hundred are not received
     _, observer = begin(shared, write_own_index, handles, fds=fds)
     assert observer.wait_for_exit().exitcode == 0
     for index, (reader, _) in enumerate(pipes):

@@ -1,4 +1,4 @@
-"""What an agent is told of the end of its link."""
+"""Notices of an agent about the end of its link."""
 
 from __future__ import annotations
 

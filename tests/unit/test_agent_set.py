@@ -1,4 +1,4 @@
-"""The agents of one shape: who gets which children, and who waits for none."""
+"""Agents of one shape: which children they get, and which children are refused."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ ERROR = FiberError("no agent will come")
 
 
 class Nothing:
-    """A hub, an output and a link of which nothing is wanted here, nor of what they return."""
+    """Hub, output and link that these tests do not look at."""
 
     def __getattr__(self, name: str) -> Any:
         return lambda *args, **kwargs: self
 
 
 class Owner:
-    """Hears of one child."""
+    """Observer of one child."""
 
     def __init__(self) -> None:
         self.report: ExitReport | None = None
@@ -48,7 +48,7 @@ class Site:
         return self.agents.join(name, link)
 
     def child(self) -> tuple[RemoteChild, Owner]:
-        """One that is not started yet."""
+        """Return a child that is not started yet, and its owner."""
         owner: Any = Owner()
         spec = ChildSpec(
             name="child", method="fork", preparation=b"", payload=b"", fds=(), tasks=False

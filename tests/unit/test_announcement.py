@@ -1,4 +1,4 @@
-"""What `make test` says before it begins."""
+"""Output of `make test` before it begins."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_what_is_left_out_has_its_reasons(monkeypatch: pytest.MonkeyPatch) -> No
     assert f"Python {OTHERS[-1]}: it was not found" in left_out
 
 
-# The script that finds them; the folders of interpreters in these tests have nothing else in them.
+# The script that finds them; in these tests the interpreters' folders contain only them.
 
 
 def python_script(*arguments: str, **environment: str) -> list[str]:
@@ -79,7 +79,7 @@ def python_script(*arguments: str, **environment: str) -> list[str]:
 
 
 def fake_python(file: Path, version: str, *, whole: bool = True) -> None:
-    """What answers the two questions of .ci/python as a Python of this version does."""
+    """Write a program that answers the two questions of .ci/python as this Python does."""
     file.parent.mkdir(parents=True, exist_ok=True)
     answers = f'case "$2" in *version_info*) echo {version};; *) exit {int(not whole)};; esac'
     file.write_text(f"#!/bin/sh\n{answers}\n")

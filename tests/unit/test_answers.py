@@ -39,7 +39,7 @@ def _say_of_own(*words: Any) -> Callable[[Rig, WorkerHandle, WorkerHandle], None
 
 
 def _say_unknown_of_own(rig: Rig, liar: WorkerHandle, other: WorkerHandle) -> None:
-    """Without end, the task would run again and again, and no run would count."""
+    """Answer that the function is unknown: without an end, the task would run for ever."""
     assert liar.worker is not None
     rig.say(liar, work.UNKNOWN, liar.worker.queue[0].seq)
 

@@ -16,7 +16,7 @@ MOST_LINES = 600
 USUAL_LINES = 300
 VAGUE_NAMES = {"utils", "helpers", "common", "misc"}
 CLOCKS = {"monotonic", "perf_counter", "process_time", "thread_time", "time"}
-# What only a part of Fiber needs; a program that imports Fiber and does nothing has none of it.
+# Packages that only a part of Fiber needs; a program that only imports Fiber loads none of them.
 HEAVY = {"asyncio", "cloudpickle", "cryptography", "kubernetes", "numpy", "pydantic", "pynng"}
 
 # Classes of two modules that mean the same: errors of the API server for the SDK and for the

@@ -135,7 +135,7 @@ def test_a_block_that_is_far_too_large_is_not_spent_on_little(blocks: Arena) -> 
 def test_blocks_of_readers_that_died_are_forgotten_in_their_turn(blocks: Arena) -> None:
     size = RETAINED_LIMIT // 8
     for _ in range(100):
-        blocks.settle(blocks.claim(size), sent=True)  # nobody will ever release these
+        blocks.settle(blocks.claim(size), sent=True)  # these are never released
     assert sum(block.capacity for block in blocks._blocks) <= RETAINED_LIMIT
 
 

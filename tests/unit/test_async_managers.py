@@ -17,11 +17,11 @@ from patience import PATIENCE
 
 ALL = 100
 MEETING = threading.Barrier(ALL)
-"""In the manager's process: of all the objects there."""
+"""Barrier of all objects in the manager's process."""
 
 
 class Desk:
-    """Has calls wait until it is told to let them go on."""
+    """Object whose calls wait for a signal to go on."""
 
     def __init__(self, start: int = 0) -> None:
         self.value = start
@@ -162,7 +162,7 @@ def test_a_result_can_be_a_proxy(manager: Any) -> None:
     assert isinstance(twin, AsyncBaseProxy)
     assert twin.add(1).get(PATIENCE) == 6
     assert desk.add(0).get(PATIENCE) == 5
-    desk.twin()  # nobody wants it
+    desk.twin()  # its result is unwanted
     assert desk.add(0).get(PATIENCE) == 5
     del twin
     assert wait_until(lambda: manager._number_of_objects() == objects, PATIENCE)

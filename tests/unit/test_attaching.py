@@ -37,7 +37,7 @@ def wire(hosts: Hosts, wires: tuple[Wire, Wire]) -> Iterator[Wire]:
 
 @pytest.fixture
 def is_confirming(monkeypatch: pytest.MonkeyPatch) -> Callable[[], bool]:
-    """Whether the hub was asked if it knows."""
+    """Return a function that says whether the hub was asked for a confirmation."""
     asked = []
     ask = HubStream.ask
 
@@ -50,7 +50,7 @@ def is_confirming(monkeypatch: pytest.MonkeyPatch) -> Callable[[], bool]:
 
 
 class Results:
-    """What a worker sends."""
+    """Receiver of a worker's answers."""
 
     def __init__(self) -> None:
         self.sent: list[bytes] = []
@@ -67,7 +67,7 @@ def keep(thing: Any) -> None:
 
 
 def keep_and_return(thing: Any) -> list[str]:
-    """What no short answer can carry."""
+    """Return a value that no short answer can carry."""
     KEPT.append(thing)
     return ["a list"]
 
@@ -77,21 +77,21 @@ def forget(thing: Any) -> int:
 
 
 def call(function: Callable[[Any], Any], thing: Any) -> tuple[bytes, GrantSet]:
-    """As ``apply`` sends it."""
+    """Send it as ``apply`` does."""
     payload, buffers, grants = reduction.encode_reusable((function, (thing,), {}))
     assert grants is not None
     return work.pack_calls([(payload, buffers)]), grants
 
 
 def several_calls(function: Callable[[Any], Any], thing: Any) -> tuple[bytes, GrantSet]:
-    """As ``apply_async`` sends them."""
+    """Send them as ``apply_async`` does."""
     payload, buffers, grants = reduction.encode_reusable((function, (thing,), {}))
     assert grants is not None
     return work.pack_calls([packet.dumps((abs, (-1,), {})), (payload, buffers)]), grants
 
 
 def batch(function: Callable[[Any], Any], thing: Any, stride: int = 0) -> tuple[bytes, GrantSet]:
-    """As ``map`` sends it."""
+    """Send it as ``map`` does."""
     data = pickle.dumps(function)
     payload, _, grants = reduction.encode_reusable([thing])
     assert grants is not None
@@ -106,7 +106,7 @@ KINDS = [call, several_calls, batch, partial(batch, stride=1), partial(batch, st
 def lend(
     request: pytest.FixtureRequest, hosts: Hosts, wire: Wire
 ) -> Iterator[Callable[[Any], tuple[Connection, packet.Message, GrantSet]]]:
-    """Have a function called with one end of a pipe: the other end, the message, what it grants."""
+    """Call a function with one end of a pipe; return the other end, the message, and its grants."""
     made = []
 
     def lend(function: Callable[[Any], Any]) -> tuple[Connection, packet.Message, GrantSet]:

@@ -1,4 +1,4 @@
-"""One thing after the other, on a thread that nobody has to wait for."""
+"""Background thread that runs functions in turn, and that no caller has to wait for."""
 
 from __future__ import annotations
 

@@ -138,7 +138,7 @@ def test_a_rival_that_was_too_slow_to_finish_keeps_a_budget_on_its_slowness() ->
 
 
 def test_every_budget_is_on_a_case_that_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
-    # With one processor alone nothing can be held on two.
+    # With one processor, no work can be limited to two.
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
     measured = {
         (case.measure, case.name, metric.name, contender.name)
@@ -172,7 +172,7 @@ def test_page_shows_ratio_budget_failures_and_who_was_skipped() -> None:
 
 
 def test_measuring_one_thing_again_keeps_the_other_pages(tmp_path: Path) -> None:
-    # Nothing is drawn here, as matplotlib never closes the fonts that it opens.
+    # These tests draw no picture, because matplotlib never closes the fonts that it opens.
     report.write(tmp_path, {"overhead": overhead_run(0.5, 1.0)}, new=[])
     first = report.load(tmp_path)
     assert first == {"overhead": overhead_run(0.5, 1.0)}

@@ -174,7 +174,7 @@ class Turns:
 
 
 class Heard:
-    """An observer that writes down what it hears."""
+    """Observer that writes down what it gets."""
 
     def __init__(self) -> None:
         self.words: list[Any] = []

@@ -231,13 +231,13 @@ def test_the_page_has_ratio_memory_requests_and_origin() -> None:
 
 
 class Api:
-    """As much of an API server as a trial needs.  What is asked for is there at once."""
+    """Part of an API server that a trial needs. It carries out requests at once."""
 
     def __init__(self) -> None:
         self.idle = False
-        """Whether nobody makes pods."""
+        """True if pods are never made."""
         self.restarts = False
-        """Whether the operator is another one each time."""
+        """True if another operator answers each time."""
         self.objects: dict[str, Any] = {}
         self.namespaces: set[str] = set()
         self.watches: list[queue.Queue[str | None]] = []
@@ -251,7 +251,7 @@ class Api:
             return self._answer(method, path.removesuffix("/"), body)
 
     def follow(self, watch: queue.Queue[str | None]) -> None:
-        """Tell of every change, and of those since the list, which is all that there were."""
+        """Report every change, also those since the list."""
         with self._lock:
             self.watches.append(watch)
             for body in self.objects.values():

@@ -41,7 +41,7 @@ def case_of(measure: Any, name: str, size: float = 0.02) -> Case:
     return next(case for case in measure.cases(size) if case.name == name)
 
 
-# What is not run
+# Skipped cases
 
 
 def test_thousands_of_processes_are_not_run_and_the_table_says_so() -> None:
@@ -166,7 +166,7 @@ def test_who_has_servers_gets_a_tenth_of_the_no_ops(monkeypatch: pytest.MonkeyPa
 
 
 def with_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A contender whose workers are threads: nothing is started that would have to be ended."""
+    """Use a contender whose workers are threads, so no process must be ended."""
     backend = peers.Joblib(2, None, "threading", lambda: None)
 
     class Threads(peers.Adapter):
@@ -188,7 +188,7 @@ def with_threads(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class FakeRay:
-    """Ray as far as actors go, at work when they are told to; the last one is ready first."""
+    """Stand-in for Ray's actors, which work when asked; the last one is ready first."""
 
     def remote(self, **options: Any) -> Callable[[Any], Any]:
         def actor(made: Any) -> Any:

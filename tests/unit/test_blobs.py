@@ -1,4 +1,4 @@
-"""What many children need goes to each agent once, and is forgotten there with its last user."""
+"""Blobs that many children need: they go to each agent once, and end there with their last user."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ LARGE = 3 << 20
 
 
 class Sent:
-    """What one agent was sent."""
+    """Messages to one agent."""
 
     def __init__(self) -> None:
         self.loop = SimulatedLoop()
@@ -56,7 +56,7 @@ class Sent:
         on_left()
 
     def kinds(self) -> list[str]:
-        """What has been sent since this was asked last."""
+        """Return the messages since the last call."""
         self.loop.run_for(0)
         sent, self.messages = self.messages, []
         return [f"{type(message).__name__} {message.digest[:2].hex()}" for message in sent]
@@ -81,7 +81,7 @@ def test_a_blob_is_sent_once_and_forgotten_with_its_last_holder() -> None:
 def test_the_same_content_made_anew_in_time_is_not_sent_again() -> None:
     sent, first = Sent(), Blob(b"content")
     sent.need(first)
-    del first  # the loop is told and has not looked yet
+    del first  # the loop has the notice and has not looked yet
     second = Blob(b"content")
     sent.need(second)
     assert sent.kinds() == [f"KeepBlob {name(second)}"]
@@ -206,7 +206,7 @@ def test_what_holds_a_handle_is_pickled_for_each() -> None:
     assert reduction.dump_shared(("plain",), same_host=True) is not None
     before = len(os.listdir("/proc/self/fd"))
     assert SharedArguments((theirs, bytes(LARGE))).blob(same_host=True) is None
-    # What was granted for the ones before may go only now.
+    # Only now may the grants of the earlier ones end.
     assert census.wait_until(lambda: len(os.listdir("/proc/self/fd")) <= before, PATIENCE)
     ours.close()
     theirs.close()

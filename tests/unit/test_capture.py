@@ -45,7 +45,7 @@ class Captured:
         return self.lines()
 
     def is_watched(self) -> bool:
-        """Whether the loop is woken by what comes of it."""
+        """Return whether the output wakes the loop."""
         return self._capture._reader in self._loop._readers
 
     def hang_up(self) -> None:

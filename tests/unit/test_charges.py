@@ -1,4 +1,4 @@
-"""How often a task may be lost: deaths and disruptions are counted apart."""
+"""Limits of a task's losses: deaths and disruptions are counted apart."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How much work one message carries."""
+"""Size of the work in one message."""
 
 from __future__ import annotations
 

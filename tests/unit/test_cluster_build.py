@@ -12,7 +12,7 @@ import pytest
 from cluster import build, packages, places
 from cluster.shell import ClusterError, locked
 
-# A go that builds what the module names, as empty programs, and counts its calls.
+# A go that builds the programs that the module names as empty files, and counts its calls.
 GO = """#!/bin/sh
 echo "$*" >> "$CALLS"
 while [ "$1" != -o ]; do shift; done
@@ -100,7 +100,7 @@ def test_who_cannot_install_is_told_the_command(monkeypatch: pytest.MonkeyPatch)
 
 @pytest.fixture
 def apt_get(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """As root, with an apt-get that makes an empty program of each package it installs."""
+    """Act as root, with an apt-get that makes an empty program of each package it installs."""
     folder = tmp_path / "apt"
     folder.mkdir()
     script = folder / "apt-get"

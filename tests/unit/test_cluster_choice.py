@@ -1,4 +1,4 @@
-"""Which cluster the end-to-end tests get, and what is said where there is none."""
+"""Choice of the end-to-end tests' cluster, and the message where there is none."""
 
 from __future__ import annotations
 

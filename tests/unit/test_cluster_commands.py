@@ -34,7 +34,7 @@ def test_the_readme_has_every_command() -> None:
 
 @pytest.fixture
 def shell_lines(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """What is exported where no image was brought."""
+    """Return the exported lines if no image was brought."""
     monkeypatch.setattr(lifecycle, "up", lambda _: None)
     monkeypatch.setattr(images, "brought", lambda _: None)
     return [f"export KUBECONFIG={places.KUBECONFIG}", f"export PATH={places.programs()}:$PATH"]

@@ -80,7 +80,7 @@ def test_it_is_started_again_as_it_was() -> None:
 
 
 def test_one_that_executes_another_program_has_not_ended() -> None:
-    """Its words are other ones then, and for a moment, long on a busy machine, it has none."""
+    """Command line of a process that executes another program: it is empty for a moment."""
     daemon = Daemon("changeable")
     daemon.start("sh", "-c", 'exec sh -c "echo changed; exec sleep 300.0625"', "unchanged")
     wait_for("the other program", lambda: "changed" in daemon.log.read_text(), seconds=PATIENCE)

@@ -1,4 +1,4 @@
-"""What is said of a cluster that does not come up: which part, how it ended, why, what to do."""
+"""Diagnosis of a cluster that does not come up: which part, how it ended, why, what to do."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def state(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
 
 @pytest.fixture
 def ended() -> Callable[[str], str]:
-    """What is said of a daemon that runs this script and has ended."""
+    """Return the diagnosis of a daemon that has run this script and ended."""
 
     def say(script: str) -> str:
         daemon = Daemon("node-2-containerd")

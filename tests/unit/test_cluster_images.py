@@ -251,14 +251,14 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def copied(dockerfile: str) -> list[str]:
-    """What a Dockerfile takes from its context."""
+    """Return the files that a Dockerfile takes from its context."""
     lines = (ROOT / dockerfile).read_text(encoding="utf-8").splitlines()
     words = [line.split() for line in lines if line.startswith("COPY ") and "--from" not in line]
     return [source for line in words for source in line[1:-1]]
 
 
 def covers(path: str, other: str) -> bool:
-    """Whether one path is the other or above it."""
+    """Return whether one path is the other or above it."""
     return Path(other).is_relative_to(path)
 
 

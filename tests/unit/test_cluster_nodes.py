@@ -1,4 +1,4 @@
-"""What nodes are told, what of them is recognised as ours, and who may use the cluster."""
+"""Settings of nodes, recognition of this project's nodes, and rights to use the cluster."""
 
 from __future__ import annotations
 
@@ -162,7 +162,7 @@ def test_a_cluster_of_other_versions_is_left_alone() -> None:
 
 @pytest.fixture
 def cleared(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
-    """One entry for each time that the cluster was taken down."""
+    """Return a list with one entry for each time that the cluster was taken down."""
     times: list[bool] = []
     monkeypatch.setattr(lifecycle, "take_down", lambda: times.append(True))
     return times

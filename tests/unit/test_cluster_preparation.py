@@ -1,4 +1,4 @@
-"""What is done ahead of the tests, by what the machine has; and it never fails."""
+"""Preparation before the tests, by the machine's abilities; it never fails."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from cluster.shell import ClusterError
 
 @pytest.fixture
 def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """What was done, on a machine that has nothing yet and can run our own cluster."""
+    """Return the preparations on a fresh machine that can run the project's cluster."""
     steps: list[str] = []
     monkeypatch.delenv("KUBECONFIG", raising=False)
     monkeypatch.setattr("shutil.which", lambda *_, **__: None)

@@ -96,7 +96,7 @@ def test_all_are_notified_from_elsewhere(brought: Callable[[Any], Any]) -> None:
     here, woken = fiber.Condition(fiber.Lock()), []
     there = brought(here)
     threads = [waiter(condition, woken, "") for condition in (here, there, here, there)]
-    # Who waits counts as waiting before it lets go of the lock, or it could miss who notifies.
+    # A waiter counts as waiting before it releases the lock, or it could miss a notification.
     assert wait_until(lambda: repr(here) == "<Condition(<Lock(owner=None)>, 4)>", PATIENCE)
     with there:
         there.notify(1)

@@ -408,7 +408,7 @@ class Clock:
 
 @pytest.fixture
 def looks(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """When the socket was looked at, by a clock of its own."""
+    """Return the times at which the socket was read, by a simulated clock."""
     clock, times = Clock(), list[float]()
     try_recv = UnixChannel.try_recv
 

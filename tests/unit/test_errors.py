@@ -16,7 +16,7 @@ from fiber import errors
 
 
 class Custom(errors.FiberError):
-    """What a user may derive: an __init__ that takes something else than the message."""
+    """Error that a user may derive: its __init__ takes something else than the message."""
 
     def __init__(self, *, code: int) -> None:
         super().__init__(f"code {code}")

@@ -29,7 +29,7 @@ from patience import PATIENCE
 from unit import pool_tasks as tasks
 from unit.executor_rig import Results, Rig
 
-"""For what another thread does."""
+"""Yield to another thread."""
 
 
 @pytest.fixture
@@ -416,7 +416,7 @@ def test_a_call_that_a_recall_took_from_a_lent_worker_is_sent_again(rig: Rig) ->
             """The worker has nothing to answer."""
 
         def close(self) -> None:
-            """It has no descriptor."""
+            """Return no descriptor."""
 
     class Awaited(Results):
         def get(self) -> int:
@@ -425,7 +425,7 @@ def test_a_call_that_a_recall_took_from_a_lent_worker_is_sent_again(rig: Rig) ->
 
     for handle, child in zip(rig.handles, rig.children, strict=True):
         child.lend = partial(Recalled, handle)  # type: ignore[assignment,method-assign]
-    for _ in range(2):  # the first one's answer has its worker lent
+    for _ in range(2):  # the first one's answer leads to a lease of its worker
         assert rig.executor.call_and_wait(Awaited(), tasks.square, (3,), {}) == 1
     assert len(list(rig.deliveries())) == 2, "the second call was not sent again"
 
@@ -497,14 +497,14 @@ def test_nobody_waits_for_workers_of_a_loop_that_has_failed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     rig = Rig(2, ready=False)
-    rig.loop.held = True  # it does nothing any more
+    rig.loop.held = True  # it has no work left
     found = wait_in_a_thread(rig.executor, monkeypatch)
     rig.executor.broken(FiberError("the loop has failed"))
     assert str(found.exception(PATIENCE)) == "the loop has failed"
 
 
 def wait_in_a_thread(executor: PoolExecutor, patch: pytest.MonkeyPatch) -> Future[bool]:
-    """As a caller of ``wait_until_workers_up``; returns once that one waits."""
+    """Call ``wait_until_workers_up`` in a thread; return once it waits."""
     found: Future[bool] = Future()
     asked = threading.Event()
 

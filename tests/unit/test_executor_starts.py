@@ -55,7 +55,7 @@ def test_a_worker_that_cannot_be_started_is_tried_again(rig: Rig) -> None:
 
 @pytest.fixture
 def no_thread(rig: Rig) -> RuntimeError:
-    """What is raised as the background thread cannot be started."""
+    """Make the background thread's start fail; return the error."""
     rig.background.refusal = RuntimeError("can't start new thread")
     return rig.background.refusal
 

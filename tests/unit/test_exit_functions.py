@@ -1,4 +1,4 @@
-"""What a child registered to be done at its end is done, once: atexit, finalizers, queues."""
+"""Exit functions of a child run once: atexit, finalizers, queues."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def test_what_they_print_is_not_lost(tmp_path: Path, method: str) -> None:
 
 
 def test_what_the_main_module_registers_is_for_the_process_that_imports_it(tmp_path: Path) -> None:
-    # Forked children share what it made with their zygote, say a folder: none may remove it.
+    # Forked children share objects with their zygote, say a folder: none may remove it.
     done = run_script(
         tmp_path,
         """

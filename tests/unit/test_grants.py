@@ -1,4 +1,4 @@
-"""Which objects of a hub a process can use: those that it was handed, while it has them.
+"""Rights of a process to a hub's objects: it can use those that it was handed, while it has them.
 
 Host ``a`` has the objects; this process, with the key of that hub, is on host ``b``.
 """

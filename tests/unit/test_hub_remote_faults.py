@@ -323,7 +323,7 @@ def test_the_thread_that_carries_the_answers_does_not_wait_for_one(hosts: Hosts,
     outcome: list[Any] = []
 
     def on_the_loop(data: bytes) -> None:
-        remote = pickle.loads(data)  # fine: nothing is waited for
+        remote = pickle.loads(data)  # fine: no one waits
         outcome.append(remote)
         try:
             remote.recv()

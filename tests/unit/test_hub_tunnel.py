@@ -309,7 +309,7 @@ def test_a_slow_reader_holds_the_sender_and_not_the_memory(agents: Hosts) -> Non
         sender.start()
         assert wait_until(lambda: len(sent) >= 2, PATIENCE)
         assert here.poll(PATIENCE)
-        # What fits into the pipe, and nothing in between.
+        # As many bytes as fit into the pipe, without gaps.
         assert not wait_until(lambda: len(sent) > 5, 0.2)
         for _ in range(30):
             assert len(here.recv_bytes()) == 1_000_000

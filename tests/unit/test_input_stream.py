@@ -13,7 +13,7 @@ from fiber._runtime.work_items import AHEAD, InputStream
 from unit.ledger_steps import known
 
 SLOW_TASKS = known(1.0, 1)
-"""Of which one is a message."""
+"""Tasks of which one is a message."""
 
 
 class Reading:
@@ -48,7 +48,7 @@ class Reading:
         self.stream.read(self.items(iterable))
 
     def begin(self, iterable: Any) -> None:
-        """Read on a thread of its own."""
+        """Read on a separate thread."""
 
         def read() -> None:
             try:

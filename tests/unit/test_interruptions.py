@@ -46,7 +46,7 @@ MORE_THAN_FITS = 2000
 
 
 def without_deadlock(function: Callable[[], Any]) -> Any:
-    """Its result, or a failure if it does not come."""
+    """Return its result, or fail if it does not come."""
     results: list[Any] = []
     thread = threading.Thread(target=lambda: results.append(function()), daemon=True)
     thread.start()
@@ -86,7 +86,7 @@ def test_ctrl_c_at_any_line_of_a_put_leaves_a_queue_that_works(before: int) -> N
     files = {queues.__file__, queue_delivery.__file__}
 
     def put_and_drain(stop: int) -> bool:
-        """Whether the put was interrupted, at its step number ``stop``."""
+        """Return whether the put was interrupted, at its step number ``stop``."""
         queue: Any = fiber.Queue()
         for number in range(before):
             queue.put(number)
@@ -116,7 +116,7 @@ def test_ctrl_c_at_any_step_of_a_put_costs_no_place_and_no_join(
     files = {queues.__file__, queue_delivery.__file__, channels.__file__}
 
     def put(stop: int) -> bool:
-        """Whether the put was interrupted, at its step number ``stop``."""
+        """Return whether the put was interrupted, at its step number ``stop``."""
         queue = make(1)
         interrupted = is_interrupted(lambda: queue.put("interrupted"), stop, files)
         there = len(queue._feeder._unsent) + queue._inbox.poll(0)
@@ -243,7 +243,7 @@ def test_who_waits_for_a_hub_that_ends_is_told(
 
 
 def striking(action: Callable[[], Any], files: set[str]) -> Callable[..., Any]:
-    """For ``sys.settrace``: do something once at each line of the code in ``files``."""
+    """Return a trace function that calls an action once at each line of the code in ``files``."""
     struck: set[tuple[Any, int]] = set()
 
     def trace(frame: FrameType, event: str, _arg: Any) -> Any:
@@ -291,7 +291,7 @@ def test_opening_the_hub_within_opening_it(hosts: Hosts, monkeypatch: pytest.Mon
 
 def test_a_handler_at_any_line_of_opening_the_hub_may_wait_for_the_loop(hosts: Hosts) -> None:
     def opened_twice(line: int) -> bool:
-        """Whether opening a hub was interrupted, at its line number ``line``."""
+        """Return whether opening a hub was interrupted, at its line number ``line``."""
         opening, lines = hosts[f"host {line}"], itertools.count()
         seen: list[Any] = []
         known = threading.Event()
@@ -426,7 +426,7 @@ MAKERS: dict[str, Callable[[], Any]] = {
 
 
 def descriptors() -> int:
-    """How many there are, without segments of shared memory, which the heap keeps or renews."""
+    """Return the number of descriptors without segments of shared memory, which the heap keeps."""
     count = 0
     for number in os.listdir("/proc/self/fd"):
         with contextlib.suppress(FileNotFoundError):  # that of the listing itself
@@ -499,7 +499,7 @@ def test_whatever_interrupts_a_large_message_none_is_damaged_and_no_descriptor_l
     before = os.listdir("/proc/self/fd")
 
     def strike(step: int) -> bool:
-        """Whether the exchange was interrupted, at this step."""
+        """Return whether the exchange was interrupted, at this step."""
         monkeypatch.setattr(packet, "_arena", Arena())
         pair = channels.socketpair("testing")
         with pair[0] as here, pair[1] as there:

@@ -186,7 +186,7 @@ def test_options_of_workers_that_are_there() -> None:
 
 
 def look(array: Any) -> tuple[int, bool, float]:
-    """What a task sees of an array: the inode of its memory, whether it is read-only, its sum."""
+    """Return how a task sees an array: its inode, whether it is read-only, and its sum."""
     address = array.__array_interface__["data"][0]
     for line in Path("/proc/self/maps").read_text().splitlines():
         limits, _, _, _, inode, *_ = line.split()
@@ -197,7 +197,7 @@ def look(array: Any) -> tuple[int, bool, float]:
 
 
 def seen(array: Any, **options: Any) -> list[tuple[int, bool]]:
-    """By each task of a loop over this array: inodes, and whether it is read-only."""
+    """Return how each task of a loop sees this array: inodes, and whether it is read-only."""
     options = {"max_nbytes": LARGE, "batch_size": 1, **options}
     found = joblib.Parallel(2, backend="fiber", **options)(call(look)(array) for _ in range(5))
     assert {total for *_, total in found} == {float(array.sum())}

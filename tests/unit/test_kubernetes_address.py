@@ -14,7 +14,7 @@ from fiber.errors import ConfigError, FiberPoolError
 
 
 class Cluster:
-    """What ``reachable_address`` asks of an Api, and the ways that this machine has."""
+    """Stand-in for an Api as ``reachable_address`` uses it, and the routes of this machine."""
 
     def __init__(self) -> None:
         self.in_cluster = False

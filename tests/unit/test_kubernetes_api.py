@@ -279,7 +279,8 @@ def test_a_pod_without_an_account_says_what_to_do(account: tuple[Served, Path]) 
         Api.connect()
 
 
-# asyncio of Python 3.12, which serves here, never closes what a client cut off within TLS.
+# asyncio of Python 3.12, which serves here, never closes connections that a client cut off within
+# TLS.
 @pytest.mark.filterwarnings("ignore:Exception ignored in:pytest.PytestUnraisableExceptionWarning")
 def test_a_watch_over_tls_is_stopped_from_another_thread(
     account: tuple[Served, Path], connect: Callable[..., Api]

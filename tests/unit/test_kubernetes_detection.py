@@ -1,4 +1,4 @@
-"""Which backend a program has that chose none: pods where it may make them, else this machine."""
+"""Default backend of a program: pods where it may make them, else this machine."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Account:
         self._answer = answer
         self.served = True
         self.leases: dict[str, dict[str, Any] | Exception] = {"kube-public": {"spec": FRESH}}
-        """What the API server answers about an operator's Lease, by namespace."""
+        """Answers of the API server about an operator's Lease, by namespace."""
         self.got: list[str] = []
         self.asked: list[dict[str, Any]] = []
         self.closed = False

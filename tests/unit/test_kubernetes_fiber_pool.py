@@ -37,7 +37,7 @@ def told() -> Told:
 
 
 def changes(rig: Rig) -> list[tuple[str, str]]:
-    """What was asked for that changes something."""
+    """Return the calls that change something."""
     calls = (call for call in rig.server.api.calls if call.verb not in ("get", "list", "watch"))
     return [(call.verb, call.plural) for call in calls]
 
@@ -225,7 +225,7 @@ def test_the_name_of_somebody_elses_pool(rig: Rig, told: Told) -> None:
     assert rig.spec()["master"]["identity"] == OTHER.identity
 
 
-# -- What is wanted
+# -- Demand
 
 
 def test_only_the_newest_demand_is_written(rig: Rig, told: Told) -> None:
@@ -268,7 +268,7 @@ def test_names_to_release_are_written_until_their_pods_are_gone(
     assert rig.spec()["scaleDown"]["release"] == ["es-1-b"]
 
 
-# -- What it hears
+# -- Notices
 
 
 def test_it_tells_status_and_pods(rig: Rig, told: Told) -> None:

@@ -249,7 +249,7 @@ def test_a_login_or_right_that_stays_away_ends_the_thread(
 
 
 def test_an_api_server_that_was_away_may_refuse_as_it_comes_back(case: Case) -> None:
-    """It has not read who may do what."""
+    """Simulate an API server that has not read the roles yet."""
     case.now += 60
     case.rig.server.api.faults.append(Fault("patch", "leases", status=403, times=2))
     for _ in range(2):

@@ -176,7 +176,7 @@ def test_an_end_while_it_is_opened_makes_no_pool_and_closes_what_listens(site: S
 
 
 def until_the_end(cancel: threading.Event) -> PreparedPool:
-    """As an API server that does not answer."""
+    """Fail as an API server that does not answer."""
     assert cancel.wait(PATIENCE)
     raise FiberError("the end")
 

@@ -1,4 +1,4 @@
-"""What a status means to the program: warnings, errors that end a wait, one line for people."""
+"""Statuses as a program sees them: warnings, errors that end a wait, one line for people."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is said while a wait lasts: one live line on a terminal, few lines elsewhere."""
+"""Messages during a wait: one live line on a terminal, few lines elsewhere."""
 
 from __future__ import annotations
 

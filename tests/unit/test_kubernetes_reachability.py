@@ -118,7 +118,7 @@ def test_a_wait_for_agents_that_do_not_come_is_explained_and_ends() -> None:
 
 
 def test_slow_pods_are_no_reason_for_doubt() -> None:
-    """As while an image is pulled."""
+    """Simulate pods whose image is pulled."""
     site = Site()
     site.start()
     site.pods_run(0)

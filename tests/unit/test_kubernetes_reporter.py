@@ -1,4 +1,4 @@
-"""What goes wrong with a pool: what is told of it, in which order, and how often."""
+"""Problems of a pool: which are reported, in which order, and how often."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is wanted, on its way into a pool: paced, coalesced, tried again."""
+"""Demands on their way into a pool: paced, coalesced, tried again."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What tells FiberPools apart, what they are called, and templates that people write."""
+"""Identity and names of FiberPools, and templates that people write."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from patience import PATIENCE
 
 
 class Stop(BaseException):
-    """What a signal's handler raises."""
+    """Exception that a signal's handler raises."""
 
 
 def stop(signum: int, frame: Any) -> None:
@@ -253,6 +253,6 @@ def test_nor_is_it_by_a_thread_that_reads_what_a_pool_is_to_do() -> None:
 
 
 def asleep(thread: threading.Thread) -> bool:
-    """Whether the kernel has put it to sleep."""
+    """Return whether the kernel has put the thread to sleep."""
     with open(f"/proc/self/task/{thread.native_id}/stat") as file:
         return file.read().rpartition(") ")[2].startswith("S")

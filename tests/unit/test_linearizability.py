@@ -43,7 +43,7 @@ def use_queue(shared: Any, seed: int, start: Any, histories: Any) -> None:
 
 
 def history(target: Callable[..., None], shared: Any) -> list[Operation]:
-    """What some processes did and saw."""
+    """Return the operations of some processes."""
     start, histories = fiber.Barrier(PROCESSES), fiber.Queue()
     processes = [
         fiber.Process(target=target, args=(shared, seed, start, histories))

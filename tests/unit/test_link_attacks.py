@@ -1,4 +1,4 @@
-"""What an attacker on the path can do: hold up and break off, and nothing else.
+"""Powers of an attacker on the path: to delay and to break off, and no others.
 
 ``docs/decisions/0006-one-port-accepts-agents-by-tls.md`` says why.
 """
@@ -25,7 +25,7 @@ from unit.link_site import Notes, Site, complete, port_of, say
 
 FRAMES = [b"%d " % number * 50 for number in range(30)]
 HOPS = 8 + 4
-"""Where a message's sealed part begins: behind its length and nng's count of hops."""
+"""Index where a message's sealed part begins: behind its length and nng's count of hops."""
 
 
 class Once:
@@ -138,7 +138,7 @@ def test_a_delay_costs_time(site: Site, path_of: Any) -> None:
     goes_on = threading.Event()
 
     def delay(_: Once, unit: Unit) -> list[bytes]:
-        goes_on.wait(0.3)  # the length of the delay, which is what is tested
+        goes_on.wait(0.3)  # the length of the delay, which is tested
         return [unit.data]
 
     once = Once(lambda unit: unit.kind == MESSAGE and unit.number == 4, delay)
@@ -166,7 +166,7 @@ RECORD_ATTACKS: dict[str, Callable[[Once, Unit], Any]] = {
 def test_an_attack_on_the_handshake_ends_it(
     site: Site, path_of: Any, attack: str, direction: str, number: int, monkeypatch: Any
 ) -> None:
-    """It may cost the connection, or this agent its life; but nobody takes a wrong word."""
+    """Change a message: that may end the connection, but no false message is accepted."""
     monkeypatch.setattr("fiber._transport.acceptor._DEADLINE", 0.4)
     monkeypatch.setattr("fiber._transport.dialer._GREET", 0.4)
     once = Once(
@@ -202,7 +202,7 @@ def test_a_whole_conversation_replayed_is_nobody(site: Site, path_of: Any) -> No
 
 
 def test_two_connections_have_nothing_in_common(site: Site, path_of: Any) -> None:
-    """What is said anew on a new connection is sealed anew."""
+    """Send again on a new connection: the message is sealed anew."""
     once = Once(lambda unit: unit.kind == MESSAGE and unit.number == 4, lambda *_: [CUT])
     path, listener, master = path_of(once)
     talk(site, path, listener, master)
@@ -244,7 +244,7 @@ def test_the_path_with_a_stolen_agents_key_is_no_master(site: Site) -> None:
 
 
 def test_a_proof_is_good_for_one_master_alone(site: Site) -> None:
-    """Who shows another certificate in the middle cannot pass an agent's proof on."""
+    """Relay with another certificate in the middle: an agent's proof cannot be passed on."""
     pool_key = site.credentials.pool_key
     listener, master = site.listener()
     middle = authentication.agent_context()

@@ -184,7 +184,7 @@ def test_one_who_knows_the_key_of_a_pool_cannot_pose_as_its_only_master(site: Si
 
 
 def test_a_master_without_the_key_of_the_pool_gets_no_agent(site: Site) -> None:
-    """In a warm pool, where any certificate may be the next master's."""
+    """Dial in a warm pool, where any certificate may be the next master's."""
     listener, _ = site.listener()
     warm = make_credentials("ab" * 32).agent("agent-1", "uid")
     _, agent = site.dialer(listener.address, credentials=warm)
@@ -220,7 +220,7 @@ def test_a_second_link_of_a_pod_is_refused_while_the_first_lives(site: Site) -> 
 
 
 def test_a_pod_whose_link_broke_may_begin_another(site: Site) -> None:
-    """Its agent has given this master up, and begins anew."""
+    """Dial again: the agent has given this master up, and begins anew."""
     listener, master = site.listener(keepalive=Keepalive())
     identity = Identity.of_this_process("agent-1", "uid")
     dialling, first = site.dialer(listener.address, identity=identity)

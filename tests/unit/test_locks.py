@@ -50,7 +50,7 @@ def in_fork(action: Callable[[], object]) -> None:
 
 
 def elsewhere(action: Callable[[], Any]) -> Any:
-    """Its result on another thread."""
+    """Return its result, computed on another thread."""
     results: list[Any] = []
     thread = threading.Thread(target=lambda: results.append(action()))
     thread.start()

@@ -33,7 +33,7 @@ def pipe() -> Iterator[tuple[int, int]]:
 
 @pytest.fixture
 def complaints(monkeypatch: pytest.MonkeyPatch) -> list[BaseException]:
-    """What callbacks raised."""
+    """Return the exceptions of callbacks."""
     seen: list[BaseException] = []
     monkeypatch.setattr(sys, "excepthook", lambda _kind, error, _trace: seen.append(error))
     return seen
@@ -134,7 +134,7 @@ def test_a_reader_hears_data_and_the_end(loop: Loop, pipe: tuple[int, int]) -> N
 def test_what_was_asked_for_before_something_happened_is_done_first(
     loop: Loop, pipe: tuple[int, int]
 ) -> None:
-    """Who notes what it expects with ``call_soon``, and makes it happen then, is heard in order."""
+    """Register an expectation with ``call_soon``, then cause the event: the order is kept."""
     reading, writing = pipe
     seen: list[str] = []
     busy, go_on, heard = threading.Event(), threading.Event(), threading.Event()
@@ -256,7 +256,7 @@ def test_stop_waits_for_the_end_and_leaves_no_descriptor() -> None:
     assert calls == ["asked before the stop"]
     assert not any(thread.name == "short" for thread in threading.enumerate())
     assert os.listdir("/proc/self/fd") == before
-    loop.stop()  # again is nothing
+    loop.stop()  # the second close does nothing
 
 
 def test_one_whose_thread_could_not_be_started_can_be_stopped(
@@ -341,7 +341,7 @@ def test_who_depends_on_it_is_told_if_it_fails() -> None:
     assert not loop.running
     with pytest.raises(FiberError, match="has ended by OSError"):
         loop.depend(dependent)
-    loop.call_soon(pytest.fail)  # nobody does
+    loop.call_soon(pytest.fail)  # it is not closed
     loop.stop()
 
 

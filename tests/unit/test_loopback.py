@@ -110,7 +110,7 @@ def test_nothing_secret_is_on_a_command_line_or_in_the_environment_of_children(
 
 
 def credentials_in_reach() -> list[str]:
-    """Where this process, which runs anybody's code, finds a private key of Fiber's."""
+    """Return where this process, which runs any user's code, finds a private key of Fiber's."""
     found = []
     family = [os.getpid()]
     ancestor = census.read(os.getpid())
@@ -262,7 +262,7 @@ def test_an_agent_that_does_not_come_is_not_waited_for(monkeypatch: pytest.Monke
 
 
 class Reluctant:
-    """In place of subprocess.Popen: the system refuses so many processes."""
+    """Stand-in for subprocess.Popen that fails as at the system's limit."""
 
     def __init__(self, times: int, error: int) -> None:
         self.left = times

@@ -443,7 +443,7 @@ def test_a_server_can_run_in_the_program_itself() -> None:
     server.listener.close()
 
 
-# Its own life
+# Its own lifetime
 
 
 def fail() -> None:

@@ -1,4 +1,4 @@
-"""Whether a child was killed for want of memory, as the kernel's files say."""
+"""Memory kills of children, as the kernel's files report them."""
 
 from __future__ import annotations
 

@@ -146,7 +146,7 @@ def test_a_process_that_did_not_run_blames_nobody(loop: SimulatedLoop) -> None:
     cable = Cable(loop)
     notes = Notes(cable.master)
     loop.run_for(1)
-    loop._now += 1000  # stopped, as by SIGSTOP: no timer ran, nothing was read
+    loop._now += 1000  # stopped, as by SIGSTOP: no timer ran, no packet was read
     loop.run_for(60)
     assert notes.events == []
 

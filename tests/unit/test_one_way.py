@@ -1,4 +1,4 @@
-"""One-way channels: how much a pipe or queue holds unread, and which reader gets it."""
+"""Channels in one direction: how much a pipe or queue holds unread, and which reader gets it."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ def test_small_and_large_messages_share_the_room(ends: Ends) -> None:
     assert taken == [*numbers(MORE_THAN_A_SOCKET), bytes(20_000), b"last"]
 
 
-# What a receiver gets
+# Received messages
 
 
 def test_the_descriptor_is_readable_as_long_as_there_is_something(ends: Ends) -> None:
@@ -196,7 +196,7 @@ def test_every_receiver_that_sleeps_is_woken(ends: Ends) -> None:
         got.append(receiver.recv().tobytes())
 
     overflow(sender)
-    # All that is in the socket, and nothing of the backlog: what a receiver that is woken finds.
+    # All bytes in the socket, without the backlog: a receiver that wakes up finds these.
     while (message := _received(receiver)) is not None:
         message.release()
     sleepers = [background(receive) for _ in range(5)]
@@ -289,7 +289,7 @@ def test_the_end_comes_after_the_backlog(ends: Ends) -> None:
         receiver.recv()
 
 
-# What a sender waits for
+# Conditions that a sender waits for
 
 
 def test_a_full_channel_makes_its_sender_wait_and_then_go_on(ends: Ends) -> None:

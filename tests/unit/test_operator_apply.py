@@ -64,7 +64,7 @@ async def create(door: Cluster, count: int, pace: CreationPace | None = None) ->
 
 
 def views(api: KubernetesApi) -> list[PodView]:
-    """What a list shows now."""
+    """Return the current list."""
     return [observe(pod, "worker") for pod in api.store.list("pods")]
 
 

@@ -1,4 +1,4 @@
-"""What a master may ask of a pool, and what becomes of the pool that it leaves or forgets."""
+"""Requests of a master to a pool, and the pool after the master leaves or forgets it."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_a_master_that_did_not_make_the_pool_does_not_end_it() -> None:
     assert (made.delete_pool, gone(made)) == (False, names(2))
 
 
-# -- What it releases
+# -- Released workers
 
 
 def test_a_release_below_the_minimum_deletes_and_creates_nothing() -> None:
@@ -66,7 +66,7 @@ def test_a_release_goes_where_the_minimum_is_not_what_keeps_the_worker() -> None
     wanted = tried(replicas=3, minReplicas=3, master=MASTER, scaleDown=release)
     made = plan_of(wanted, running(1), running(2), running(3))
     assert (gone(made), made.create) == (names(1), 1)
-    # An outdated one is released to be replaced, an ended one has nothing to lose.
+    # An outdated worker is released to be replaced; an ended one has no work to lose.
     idle = tried(replicas=0, minReplicas=3, master=MASTER, scaleDown=release)
     made = plan_of(idle, of_template("older", running(1)), running(2), running(3))
     assert (gone(made), made.create) == (names(1), 1)

@@ -79,7 +79,7 @@ def test_an_autoscaler_sees_the_whole_demand_of_a_template_that_never_worked() -
     for _ in range(6):
         there += plan_of(pool, *map(unschedulable, range(there))).create
     assert there == 100
-    # As many as found a node count, and those of which that is not known yet.
+    # As many as found a node count, and those whose node is not known yet.
     mixed = [*map(unschedulable, range(4)), *pulling(range(10, 13), age=5)]
     assert plan_of(pool, *mixed).create == 1
     stuck = waiting(20, "ErrImagePull", age=50)
@@ -97,7 +97,7 @@ def test_a_warm_pool_gets_few_of_a_template_that_never_worked() -> None:
 async def _pods_while_images_are_pulled(
     seconds: float, *, fails: bool, until: tuple[float, ...]
 ) -> list[int]:
-    """How many pods of 300 there are at these times, if each pull takes so long."""
+    """Return how many pods of 300 there are at these times, if each pull takes so long."""
     async with a_world() as world:
         kubelet, loop = world.kubelet, asyncio.get_running_loop()
 

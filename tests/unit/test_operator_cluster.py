@@ -70,7 +70,7 @@ def test_objects_are_made_read_changed_and_deleted() -> None:
 
 def test_a_list_has_every_page_and_only_what_is_selected() -> None:
     async def test(api: KubernetesApi, door: Cluster) -> None:
-        api.page = 3  # nobody asks for pages; a server may answer in some
+        api.page = 3  # the client asks for no pages; a server may still answer in pages
         for number in range(8):
             api.store.create("pods", "here", pod(f"p{number}", of="us"))
         api.store.create("pods", "here", pod("other", of="them"))
@@ -311,7 +311,7 @@ def test_every_call_is_observed() -> None:
 
 
 def test_no_more_calls_at_once_than_connections() -> None:
-    """What waits for its turn is not late: only the server's own time counts."""
+    """Wait for a turn: that time does not count as the server's."""
 
     async def test(api: KubernetesApi, door: Cluster) -> None:
         api.faults.append(Fault(late=8, times=12))

@@ -240,7 +240,7 @@ async def test_the_status_keeps_up_with_a_long_deletion(world: World) -> None:
 
 @played()
 async def test_a_pod_that_became_ready_meanwhile_stays(world: World) -> None:
-    """It is Pending as far as the watch has shown, and the master has it now."""
+    """Keep a pod that the watch still shows as Pending, and that the master has now."""
     world.make_pool(replicas=3, master=MASTER)
     await world.ready(3)
     world.kubelet.auto = False
@@ -377,7 +377,7 @@ async def test_damaged_credentials_are_told(world: World) -> None:
     ],
 )
 def test_a_spec_that_makes_no_sense_deletes_nothing(spec: Body) -> None:
-    """As the schema refuses it, this is a pool of an older or newer schema."""
+    """Use a pool of an older or newer schema, as this one refuses it."""
 
     @played()
     async def test(world: World) -> None:

@@ -119,7 +119,7 @@ async def is_deleted(world: World) -> None:
 
 
 def disruptions(world: World) -> tuple[int, int]:
-    """How many were counted, and how many events tell of one."""
+    """Return how many were counted, and how many events report one."""
     counted = sum(p["status"]["failures"]["disrupted"] for p in world.store.list("fiberpools"))
     return counted, sum(e["reason"] == "Disrupted" for e in world.store.list("events"))
 
@@ -146,7 +146,7 @@ async def _crash_after(
 
         def crash(call: Call) -> None:
             nonlocal crashed, left
-            # The Lease is renewed all the time, and has tests of its own.
+            # The Lease is renewed all the time, and has separate tests.
             left -= call.namespace != "fiber-system"
             if left == 0 and not crashed:
                 crashed = world.api.down = True
@@ -164,7 +164,7 @@ async def _crash_after(
         assert belongings(world) in ([1, 1, 1], [0, 0, 0])
         assert world.live_at_most <= 5
         await world.settled()
-        # An event may get lost with the operator that would have told of it.
+        # The operator may end before it has posted an event.
         counted, told = disruptions(world)
         assert counted == disrupted
         assert told <= disrupted

@@ -1,4 +1,4 @@
-"""What a pool has beside its pods, and whose it is."""
+"""Objects of a pool beside its pods, and their owners."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ def template(container: Body | None = None, metadata: Body | None = None, **spec
 
 
 def creations(world: World) -> list[bool]:
-    """Of each pod that was to be created: whether it was a dry run."""
+    """Return for each created pod whether it was a dry run."""
     return [c.dry_run for c in world.api.calls if (c.verb, c.plural) == ("create", "pods")]
 
 
@@ -116,7 +116,7 @@ def test_annotations_that_are_none_are_left_to_the_api_server() -> None:
     assert pod(pool, "es-0000000001", "10.96.1.2:7070")["metadata"]["annotations"] == "x"
 
 
-# -- What a refusal means
+# -- Refusals
 
 
 DECODING = f'{CANNOT}: strict decoding error: unknown field "spec.containers[0].imgae"'

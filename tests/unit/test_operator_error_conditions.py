@@ -25,7 +25,7 @@ Right = tuple[str, str]
 
 
 def rights() -> list[Right]:
-    """What the chart lets the operator do in the namespaces of pools."""
+    """Return the rights of the operator's chart in the namespaces of pools."""
     text = RULES[RULES.index("\npools:") : RULES.index("\nown:")]
     rules = yaml.safe_load(text)["pools"]
     return [(v, plural) for rule in rules for plural in rule["resources"] for v in rule["verbs"]]
@@ -42,7 +42,7 @@ def denied(right: Right) -> Fault:
     return fault(right, status=403, reason="Forbidden", message=message)
 
 
-# -- Rights: what a pool goes through in which each is needed
+# -- Rights: a pool's events that need each right
 
 
 async def is_new(world: World) -> None:
@@ -66,7 +66,9 @@ async def gets_a_master_of_another_family(world: World) -> None:
 
 
 async def loses_its_master(world: World) -> None:
-    world.store.create("leases", NAMESPACE, {"metadata": {"name": "es"}})  # nobody renews it
+    world.store.create(
+        "leases", NAMESPACE, {"metadata": {"name": "es"}}
+    )  # the Lease is not renewed
     world.edit(master=LOST, onLost="Delete")
 
 
@@ -110,7 +112,7 @@ LIVES: dict[Right, Callable[[World], Awaitable[None]]] = {
     ("get", "leases"): loses_its_master,
     ("delete", "fiberpools"): loses_its_master,
 }
-"""What is told in the status."""
+"""Problems that the status shows, by missing right."""
 
 BY_EVENT = [("patch", "fiberpools/status")]
 BY_READINESS = [
@@ -120,7 +122,7 @@ BY_READINESS = [
     ("watch", "leases"),
 ]
 AT_START = [("list", "pods"), ("watch", "pods")]
-"""What is told in the status of each pool by an operator that never had the right."""
+"""Rights whose lack from the start the status of each pool shows."""
 BY_LOG = [("get", "fiberpools")]
 EVENTS = [("create", "events"), ("list", "events"), ("patch", "events")]
 """Only an explanation is missing without these."""
@@ -227,7 +229,7 @@ def test_without_the_right_to_list_pools_the_operator_is_not_ready() -> None:
     test()
 
 
-# -- A refusal does not hold up what it is not about
+# -- A refusal only stops what depends on it
 
 
 @played
@@ -275,7 +277,7 @@ WAYS: dict[str, tuple[Body, float]] = {
     "no-answer": ({}, 0.0),
     "busy": ({"status": 429, "retry_after": 3, "message": "too many requests"}, 0.0),
 }
-"""How pods cannot be made, and when the first call has failed."""
+"""Ways in which pods cannot be made, and the first failed call."""
 
 
 @pytest.mark.parametrize("way", WAYS)
@@ -351,7 +353,7 @@ def test_a_call_that_fails_is_told_in_the_status(right: Right) -> None:
     test()
 
 
-# -- Nobody knows which pods there are
+# -- The list of pods is unknown
 
 
 @played

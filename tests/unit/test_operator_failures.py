@@ -42,7 +42,7 @@ def failed(number: int, *, created: float = NOW - 60, ago: float = 0, **fields: 
 
 
 def lived(number: int, **fields: Any) -> PodView:
-    """One that failed after it had worked."""
+    """Return a pod that failed after it had worked."""
     return failed(number, **{"was_ready": True, "ran": 900.0, **fields})
 
 

@@ -334,7 +334,7 @@ async def test_a_master_that_comes_back_in_the_last_moment_keeps_its_pool(world:
 
 
 def a_master_attaches_after(verb: str, plural: str, world: World, **spec: Any) -> None:
-    """In the middle of the operator's look: once the next such call is answered."""
+    """Act in the middle of the operator's reconcile: once the next such call is answered."""
 
     def attach(call: Call) -> None:
         if (call.verb, call.plural) == (verb, plural):

@@ -1,4 +1,4 @@
-"""Nothing that can stand in a pool or in a pod ends the operator, or a worker that is well."""
+"""Garbage in a pool or a pod ends neither the operator nor a healthy worker."""
 
 from __future__ import annotations
 
@@ -168,7 +168,7 @@ VIEWS = [
 
 
 def check_plan(pool: FiberPool, document: Body, pods: list[PodView], alive: bool | None) -> Plan:
-    """What must hold of any: it can be written, is what was written, and stays so."""
+    """Check a patch: it can be written, reads back the same, and is stable."""
     known = knowledge(pool, alive)
     made = plan(pool, pods, known, NOW)
     if made.status is not None:
@@ -295,7 +295,7 @@ def lost(world: World) -> list[str]:
 
 
 def faults_of_its_own(world: World) -> float | None:
-    """How many turns ended with an exception that is no answer of the API server."""
+    """Return how many reconciles ended with an exception that is no answer of the API server."""
     registry = world.program.metrics.registry
     return registry.get_sample_value("fiber_operator_reconciles_total", {"outcome": "error"})
 
@@ -349,7 +349,7 @@ def test_an_operator_outlives_garbage_in_the_status(data: st.DataObject) -> None
 def test_an_operator_outlives_garbage_in_the_spec(data: st.DataObject) -> None:
     def spoil(world: World) -> None:
         spec = world.store.get("fiberpools", NAMESPACE, "es")["spec"]
-        # What the user says in the right type is an order, and carried out.
+        # A field of the right type is an order, and carried out.
         replaced(world, "fiberpools", "es", spec=spoilt_in_type(data.draw, {"spec": spec})["spec"])
 
     play(spoil, POOL)

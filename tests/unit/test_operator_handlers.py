@@ -42,7 +42,7 @@ class Watching:
         self.renewals: list[tuple[str, str, str, int | None]] = []
         self.starts: list[bool] = []
         self.answers: dict[str, str] = {}
-        """What was asked -> why that failed the last time, or nothing."""
+        """Errors by request: why it failed the last time, if it did."""
         self.gates = 0
         self.stop = asyncio.Event()
         self._task = asyncio.ensure_future(
@@ -102,7 +102,7 @@ def played(*namespaces: str) -> Callable[[Callable[[Watching], Coroutine[Any, An
 
         def run() -> None:
             virtual_time.run(main())
-            gc.collect()  # what was not closed is told now, not in another test
+            gc.collect()  # a watch that was not closed warns now, not in another test
 
         run.__doc__ = test.__doc__
         return run
@@ -363,7 +363,7 @@ def test_the_thread_tells_the_loop_that_made_it_and_ends_with_it() -> None:
 
 
 def test_a_fault_of_ours_holds_up_no_other_event() -> None:
-    """Of two events that come together the first one is not taken."""
+    """Lose the first of two events that come together."""
 
     async def main() -> None:
         told: list[str] = []
@@ -410,7 +410,7 @@ def test_a_thread_that_cannot_watch_ends_the_program() -> None:
 
 
 def test_a_kopf_that_does_not_end_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It begins to end, and loses the first cancellations of what it waits for."""
+    """Simulate a kopf that loses the first cancellations while it ends."""
     runs = 0
 
     async def stubborn(**options: Any) -> None:

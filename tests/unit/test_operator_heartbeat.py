@@ -20,7 +20,7 @@ def lease(world: World, namespace: str = names.SERVING_NAMESPACE) -> Body | None
 
 
 def is_fresh(world: World, namespace: str = names.SERVING_NAMESPACE) -> bool:
-    """Whether a program would take the operator for a living one."""
+    """Return whether a program would take the operator for a living one."""
     spec = (lease(world, namespace) or {"spec": {}})["spec"]
     if not spec:
         return False

@@ -34,7 +34,7 @@ class Site:
         self.store = api.store
         self.changed: list[Key] = []
         self.answers: dict[str, str] = {}
-        """What was asked -> why that failed the last time, or nothing."""
+        """Errors by request: why it failed the last time, if it did."""
         self.informer = PodInformer(
             cluster, namespaces=namespaces, changed=self.changed.append, answered=self._answered
         )
@@ -166,7 +166,7 @@ async def test_only_the_given_namespaces_are_watched(site: Site) -> None:
     assert site.answers == {"watch pods in one": "", "watch pods in two": ""}
 
 
-# -- What the operator did itself
+# -- The operator's own changes
 
 
 @played()

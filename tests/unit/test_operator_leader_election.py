@@ -1,4 +1,4 @@
-"""One of several operators acts, through all faults of it and of the API server."""
+"""Leader election: one operator acts, through all faults of operators and API server."""
 
 from __future__ import annotations
 
@@ -315,7 +315,7 @@ async def test_who_has_resigned_never_acts_again(found: Operators) -> None:
         assert not elector.is_leader
 
 
-# -- What was begun under a Lease ends before another may begin
+# -- Calls that were begun under a Lease end before another operator may begin
 
 
 @pytest.mark.parametrize("seconds", [6, 15, 60, 3600])

@@ -30,7 +30,7 @@ class Watch:
         self.api, self.store = api, api.store
         self.told: list[tuple[float, LeaseVerdict]] = []
         self.leases: dict[Key, MasterLease] = {}
-        """Those of other pools than ``ES``."""
+        """Leases of other pools than ``ES``."""
         self.deaf = False
         """No change is heard of."""
         self.monitor = LeaseMonitor(door, self._tell)
@@ -163,7 +163,7 @@ async def test_a_lease_that_was_made_after_its_master_was_seen_is_alive_at_once(
 
 @played
 async def test_a_lease_that_comes_soon_after_its_pool_is_not_missed(watch: Watch) -> None:
-    """As at every start of a program, whose Lease belongs to its pool."""
+    """Simulate the start of a program, whose Lease belongs to its pool."""
     watch.monitor.follow(ES, LEASE)
     await asyncio.sleep(MISSING_AFTER / 2)
     watch.renew()
@@ -267,7 +267,7 @@ async def test_an_outage_that_ends_just_before_the_time_is_over_is_not_the_maste
     watch.monitor.follow(ES, LEASE)
     await asyncio.sleep(21)
     watch.die()
-    await asyncio.sleep(29)  # nobody could be had, and nobody has asked
+    await asyncio.sleep(29)  # no reader was available, and none has asked
     await asyncio.sleep(5)
     watch.renew()
     await asyncio.sleep(100)

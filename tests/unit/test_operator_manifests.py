@@ -60,7 +60,7 @@ def test_the_slice_of_a_warm_pool_leads_nowhere() -> None:
 
 
 def read_back(body: dict[str, Any]) -> dict[str, Any]:
-    """As the API server shows a slice: empty lists are null, and more is filled in."""
+    """Return a slice as the API server shows it: empty lists are null, and more is filled in."""
     empty = {key: None for key in ("endpoints", "ports") if not body[key]}
     return {**body, **empty, "metadata": {**body["metadata"], "uid": "x"}}
 

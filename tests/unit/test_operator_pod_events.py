@@ -1,4 +1,4 @@
-"""Which of a pod's events still says why it does not start."""
+"""Events of a pod that still explain why it does not start."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def event(said: tuple[str, str], second: float = 0.0, **fields: Any) -> Body:
 
 
 def warning_of(*events: Body, pod: PodView = POD) -> str:
-    """What is found of ``pod`` where these events were written in this order."""
+    """Return the result for ``pod`` if these events were written in this order."""
 
     async def main() -> dict[str, str]:
         api = KubernetesApi(Store(asyncio.get_running_loop().time))

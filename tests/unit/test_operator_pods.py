@@ -1,4 +1,4 @@
-"""What the operator makes of a pod's JSON."""
+"""Parsing of a pod's JSON by the operator."""
 
 from __future__ import annotations
 
@@ -171,7 +171,7 @@ def test_a_worker_has_ended_even_if_its_sidecar_goes_on() -> None:
 
 
 def test_a_pod_does_not_linger_because_its_phase_is_late() -> None:
-    # Kubernetes tells of a container's end up to a second before the pod's phase is Failed.
+    # Kubernetes reports a container's end up to a second before the pod's phase is Failed.
     document = ended(code=1, phase="Running")
     assert not look(document).lingers
     end = {"exitCode": 0, "reason": "Completed"}

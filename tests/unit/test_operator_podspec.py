@@ -363,7 +363,7 @@ def test_what_the_sdk_writes_starts_no_new_attempt() -> None:
         assert spec_hash(make_pool(**change)) != first
 
 
-# -- Requests that nothing speaks of
+# -- Requests that the template does not set
 
 REQUESTS = {"cpu": "50m", "memory": "64Mi"}
 

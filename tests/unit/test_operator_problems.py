@@ -1,4 +1,4 @@
-"""What a person reads when something is wrong: what, why, what to do."""
+"""Problems as a person reads them: what, why, what to do."""
 
 from __future__ import annotations
 

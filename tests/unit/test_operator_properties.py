@@ -23,7 +23,7 @@ from unit.operator_objects import ADDRESS, MASTER, NOW, make_pool, name_of, pool
 from unit.test_operator_pods import ANYTHING
 
 NO_SHRINKING = (Phase.explicit, Phase.reuse, Phase.generate)
-"""For what takes long: a failure is shown as it was found."""
+"""Phases of hypothesis for slow tests: a failure is shown as it was found."""
 
 NUMBERS = st.integers(0, 15)
 TROUBLES: dict[PodState, list[Trouble | None]] = {
@@ -263,7 +263,7 @@ def nothing_is_planned_twice(
 @settings(max_examples=250, deadline=None)
 @given(cases())
 def test_what_holds_of_every_plan(case: Case) -> None:
-    """One plan, and all that must hold of it: to draw a case takes longer than to check it."""
+    """Check all properties of one plan: to draw a case takes longer than to check it."""
     made = plan(*case, NOW)
     only_pods_of_the_pool_are_deleted_and_each_once(made, *case)
     a_pool_is_deleted_for_a_lease_that_this_process_saw_expire_alone(made, *case)
@@ -276,7 +276,7 @@ def test_what_holds_of_every_plan(case: Case) -> None:
 
 
 def at_work(spec: dict[str, Any]) -> dict[str, Any]:
-    """With a master, whose workers are its own."""
+    """Return the spec with a master, which owns its workers."""
     strategy = spec["update"]["strategy"].replace("Recreate", "OnIdle")
     scale_down = {**spec["scaleDown"], "policy": "ReleasedOnly"}
     changed = {"master": MASTER, "suspend": False, "scaleDown": scale_down}

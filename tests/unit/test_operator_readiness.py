@@ -1,4 +1,4 @@
-"""When a pod is Ready: the probe that waits for its agent's link, and what is told meanwhile."""
+"""Readiness of a pod: the probe that waits for its agent's link, and the status meanwhile."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_a_pod_that_is_made_after_a_master_was_lost_waits_for_the_next_on_purpos
 
 
 def test_the_probe_ends_when_the_file_is_there(tmp_path: Path) -> None:
-    """By the interpreter that the init container has linked to."""
+    """Run the probe by the interpreter that the init container has linked to."""
     os.symlink(os.path.realpath(sys.executable), tmp_path / names.PROBE_PROGRAM)
     command = [
         word.replace(names.CREDENTIALS_DIRECTORY, str(tmp_path))
@@ -110,7 +110,7 @@ def test_the_probe_ends_when_the_file_is_there(tmp_path: Path) -> None:
     assert "no master has answered the agent yet" in failed.stderr
 
 
-# -- What is planned and told
+# -- Plan and status
 
 
 def test_a_pod_that_is_not_linked_counts_as_one_that_runs() -> None:

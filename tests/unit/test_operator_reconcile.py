@@ -1,4 +1,4 @@
-"""Which pods are created and deleted, case by case.  What always holds is in the properties."""
+"""Creation and deletion of pods, case by case. The properties test what always holds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the pods of a pool are told apart by."""
+"""Revisions of the pods of a pool."""
 
 from __future__ import annotations
 

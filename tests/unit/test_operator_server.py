@@ -107,7 +107,7 @@ async def test_an_outage_is_no_reason_for_a_restart(world: World) -> None:
 
 
 class Parts:
-    """What health is judged by, all well until a test says otherwise."""
+    """Parts by which health is judged, all well until a test says otherwise."""
 
     def __init__(self, **statistics: float) -> None:
         self.now = 10_000.0

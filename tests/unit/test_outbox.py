@@ -50,7 +50,7 @@ def received(sock: socket.socket) -> bytes:
 
 
 def held_by_others(fd: int) -> bool:
-    """Whether someone still holds the writing end of this pipe."""
+    """Return whether another process still holds the writing end of this pipe."""
     os.set_blocking(fd, False)
     try:
         return os.read(fd, 1) != b""

@@ -1,4 +1,4 @@
-"""What remote children write, and a stderr that does not keep up with them."""
+"""Output of remote children, and a stderr that does not keep up with it."""
 
 from __future__ import annotations
 

@@ -289,7 +289,7 @@ def test_junk_raises_and_leaves_no_buffer_lent(pair: Pair, junk: bytes) -> None:
     assert packet.receive(other).tobytes() == b"next"
 
 
-# What is large
+# Large objects
 
 
 def test_large_bytes_in_a_call_are_not_copied_into_its_pickle() -> None:

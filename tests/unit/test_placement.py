@@ -1,4 +1,4 @@
-"""Which agent runs the next child, and how many agents that takes."""
+"""Choice of the agent that runs the next child, and the number of agents that this needs."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ def pool() -> Iterator[Pool]:
     pool.join()
 
 
-# Every call gives what it gives in multiprocessing
+# Every call returns the same as in multiprocessing
 
 
 def test_apply(pool: Pool) -> None:
@@ -354,7 +354,7 @@ def test_buffersize_bounds_what_is_read_and_not_consumed(pool: Pool, unordered: 
     for consumed in range(1, 300):
         next(iterator)
         assert read <= consumed + 7
-    del iterator  # nobody consumes any more: nothing more is read
+    del iterator  # results are not consumed: no more input is read
     assert wait_until(
         lambda: all(thread.name != "fiber-pool-feeder" for thread in threading.enumerate()),
         PATIENCE,

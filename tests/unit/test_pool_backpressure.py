@@ -51,7 +51,7 @@ def test_an_iterator_that_nobody_reads_holds_back_its_tasks(
     imap: Imap = getattr(pool, method)
     iterator = imap(bytearray, source([RESULT] * MANY))
     wait_until(lambda: _is_held_back(pool), "it is held back")
-    # What the workers had already comes, and no more.
+    # The results that the workers had already computed come, and no more.
     assert _unread(iterator) < MANY // 2
     assert sum(map(len, iterator)) == MANY * RESULT
 

@@ -255,7 +255,7 @@ def test_a_timeout_for_all_tasks(tmp_path: Path) -> None:
 
 @pytest.fixture
 def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What fails to start is given up as soon as it may be."""
+    """Give up early on workers that fail to start."""
     monkeypatch.setattr(start_failures, "RAISED_PATIENCE", 0.0)
     monkeypatch.setattr(start_failures, "KILLED_PATIENCE", 0.0)
 

@@ -41,7 +41,7 @@ FIBER = str(Path(fiber.__file__).parent)
 
 
 class Stop(BaseException):
-    """What a signal's handler raises."""
+    """Exception that a signal's handler raises."""
 
 
 @pytest.fixture
@@ -81,11 +81,10 @@ each_call = pytest.mark.parametrize("call", CALLS.values(), ids=CALLS.keys())
 
 
 class Striking:
-    """For a ``with`` block: do something once at each line of Fiber's, or of some of its modules,
-    that this thread passes.
+    """Block in which an action runs once at each line of Fiber's, or of some of its modules.
 
-    What that raises is raised at the line, and nothing is done at further ones; lines of finalizers
-    are spared then, as what is raised there is lost.
+    An error of the action is raised at the line, and ends the striking. Lines of finalizers are
+    spared then, because errors there are lost.
     """
 
     def __init__(self, action: Callable[[], object], *modules: ModuleType) -> None:
@@ -131,7 +130,7 @@ def _within_finalizer(frame: FrameType | None) -> bool:
 
 @pytest.fixture
 def _signals_raise() -> Iterator[None]:
-    """Of SIGUSR1 the handler raises.  Nothing is collected meanwhile, as that would lose it."""
+    """Raise from the handler of SIGUSR1, without the garbage collection, which loses errors."""
 
     def stop(signum: int, frame: Any) -> None:
         raise Stop
@@ -485,7 +484,7 @@ def test_a_runtime_whose_making_was_interrupted_leaves_no_thread(
 
 
 def forked(action: Callable[[], bytes]) -> bytes:
-    """What a child, forked from here, finds."""
+    """Return the result of a child that is forked from here."""
     read, write = os.pipe()
     pid = os.fork()
     if pid == 0:

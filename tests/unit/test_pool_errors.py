@@ -1,4 +1,4 @@
-"""What does not pickle or unpickle: an error where it belongs, never a hang, nothing else lost."""
+"""Objects that do not pickle or unpickle: an error where it belongs, and never a hang."""
 
 from __future__ import annotations
 
@@ -196,7 +196,7 @@ def test_a_function_that_does_not_pickle(pool: Pool, call: str) -> None:
 
 
 class Unreadable:
-    """It has a length, and fails when it is read."""
+    """Iterable with a length, which fails when it is read."""
 
     def __len__(self) -> int:
         return 1

@@ -1,4 +1,4 @@
-"""How a pool grows, shrinks and ends, and that nothing of it stays behind."""
+"""Growth, shrinking and end of a pool without leftovers."""
 
 from __future__ import annotations
 
@@ -173,7 +173,7 @@ def test_a_map_that_is_waited_for_ends_with_the_pool(tmp_path: Path) -> None:
     pool.join()
 
 
-# Nobody holds it any more
+# It has no owner
 
 
 def test_an_unreferenced_pool_warns_and_ends() -> None:

@@ -1,4 +1,4 @@
-"""What a person can give to a pool: every mistake is named, nothing hangs."""
+"""Options of a pool: every mistake is named, and no call hangs."""
 
 from __future__ import annotations
 

@@ -32,7 +32,8 @@ def end(pool: Pool) -> None:
 
 WAITS: dict[str, Callable[[Pool], Any]] = {
     "apply": lambda pool: pool.apply(abs, (-1,)),
-    # What is there already may be had, so these two ask for what ends with the pool alone.
+    # A task may wait for results that exist, so these two ask for something that ends with the
+    # pool.
     "apply_async": lambda pool: pool.apply_async(time.sleep, (PATIENCE,)).get(),
     "broadcast": lambda pool: pool.broadcast(abs, -1),
     "map": lambda pool: pool.map(abs, [-1]),

@@ -253,7 +253,7 @@ class FakeChild:
         self.signals: list[int] = []
 
     def start(self) -> None:
-        """Nothing comes of it."""
+        """Return without a result."""
 
     def signal(self, signum: int) -> None:
         self.signals.append(signum)

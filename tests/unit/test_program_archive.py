@@ -51,7 +51,7 @@ def test_several_folders_keep_their_names(folder: Path, tmp_path: Path) -> None:
     assert (there / "lib/tools/init.py").exists()
 
 
-# What is left out
+# Excluded files
 
 
 def names(folder: Path) -> set[str]:
@@ -192,7 +192,7 @@ PRIVATE = "-----BEGIN PRIVATE KEY-----\n" + "A" * 64 + "\n"
 
 
 def reasons(folder: Path, *others: Path) -> dict[str, tuple[Why, str]]:
-    """What is left out, and why."""
+    """Return the excluded files with the reasons."""
     return {
         os.path.relpath(left.path, folder): (left.why, left.detail)
         for left in program_files.select(layout(folder, *others)).left_out
@@ -358,7 +358,7 @@ def test_too_many_files_are_not_even_counted(folder: Path, monkeypatch: pytest.M
         files(folder)
 
 
-# What is refused
+# Refused archives
 
 
 def archive_of(**members: dict[str, object]) -> bytes:

@@ -1,4 +1,4 @@
-"""Which folders make up a program, and where they are elsewhere."""
+"""Folders that make up a program, and their places elsewhere."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ class Machine:
         self.lib = write(tmp_path / "lib", shared__init_py="")
         self.main = ModuleType("__main__")
         self.imported_by: dict[str, str] = {}
-        """How children import it."""
+        """Fields by which children import the main module."""
         monkeypatch.setenv("HOME", str(self.home))
         monkeypatch.setattr(program_layout.mp_process, "ORIGINAL_DIR", str(self.es))
-        # Without what the tests themselves have imported from outside of site-packages.
+        # Without the modules that the tests themselves have imported from outside of site-packages.
         self.modules = {"__main__": self.main}
         monkeypatch.setattr(program_layout, "sys", SimpleNamespace(modules=self.modules))
         monkeypatch.setattr(tempfile, "tempdir", "/nowhere")  # ours is in that
 
     def runs(self, file: Path, name: str | None = None) -> None:
-        """Its main module is that one; ``-m name`` if that is given."""
+        """Run that main module; ``-m name`` if that is given."""
         self.main.__file__ = str(file)
         self.imported_by = {"name": name} if name else {"path": str(file)}
         spec: Any = ModuleType("spec")

@@ -46,7 +46,7 @@ def test_submodules_are_attributes_before_anybody_imports_them(name: str) -> Non
 
 
 def public_names(module: ModuleType) -> set[str]:
-    """What a submodule of multiprocessing offers: it says so, or defines it."""
+    """Return the names that a submodule of multiprocessing offers: in __all__, or defined there."""
     if said := getattr(module, "__all__", None):
         return {name for name in said if not name.startswith("_")}
     return {

@@ -83,7 +83,7 @@ def test_a_full_queue_refuses() -> None:
 
 
 def test_a_place_that_is_given_back_twice_is_removed() -> None:
-    """As by a put that a signal interrupts after its item has left."""
+    """Interrupt a put after its item has left."""
     queue = fiber.Queue(2)
     queue.put(1)
     queue._slots.give_back()

@@ -1,4 +1,4 @@
-"""How objects become bytes: by reference, by value, with descriptors that never leak."""
+"""Pickling of objects: by reference, by value, with descriptors that never leak."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_what_plain_pickle_can_do_needs_no_cloudpickle(monkeypatch: pytest.Monke
         raise AssertionError("cloudpickle was asked")
 
     monkeypatch.setattr(reduction, "_by_value_pickler", refuse)
-    assert pickle.loads(reduction.dumps(Point.origin)).__self__ is Point  # a reducer of its own
+    assert pickle.loads(reduction.dumps(Point.origin)).__self__ is Point  # a private reducer
     process = Process(target=os.getpid)
     payload, _ = reduction.dump_process(process, same_host=True)
     assert pickle.loads(payload).name == process.name

@@ -1,4 +1,4 @@
-"""Which refusals are told, and how often."""
+"""Refusals that are reported, and how often."""
 
 from __future__ import annotations
 

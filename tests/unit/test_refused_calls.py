@@ -44,7 +44,7 @@ class Caller:
     def __init__(self) -> None:
         self.locals: weakref.WeakSet[Local] = weakref.WeakSet()
         self.frames: set[int] = set()
-        """How many frames the tracebacks had."""
+        """Numbers of frames in the tracebacks."""
 
     def call(self, function: Callable[[], object], kind: type[Exception]) -> None:
         mine = Local()

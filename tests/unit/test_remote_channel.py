@@ -149,7 +149,7 @@ def test_of_more_than_is_remembered_all_that_is_remembered_is_named_unread(
 def test_what_never_left_is_told_to_its_sender(far: Far) -> None:
     channel = far.child.lend()
     assert channel is not None
-    channel.send(7, b"call")  # waits for the loop, which hears of the end first
+    channel.send(7, b"call")  # waits for the loop, which gets the end first
     far.ends(delivered=0)
     with pytest.raises(BrokenPipeError):
         channel.receive(FOREVER)

@@ -146,7 +146,7 @@ def test_nothing_is_kept_for_nobody(far: Far, hosts: Hosts) -> None:
 
 
 def die_holding(there: Any) -> None:
-    """What the kernel does when its process dies."""
+    """Close the lock's descriptor, as the kernel does when its process dies."""
     there._semlock._holding[0].close()
 
 

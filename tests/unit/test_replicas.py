@@ -60,7 +60,7 @@ def kept(hosts: Hosts, name: str) -> Callable[[], bool]:
     return lambda: objects_kept(hosts[name]) == 0 and not hosts[name].replicas._replicas
 
 
-# What is written
+# Writes
 
 
 def test_a_write_is_seen_by_whoever_hears_of_it(hosts: Hosts, wires: tuple[Wire, Wire]) -> None:
@@ -124,7 +124,7 @@ def test_at_home_it_is_the_memory_itself(far: Far, hosts: Hosts) -> None:
         assert memory_of(pickle.loads(data)).identity == memory_of(array).identity
 
 
-# What is kept
+# Kept objects
 
 
 def test_nothing_is_left_once_nobody_uses_it(star: Hosts) -> None:
@@ -168,7 +168,7 @@ def test_a_link_that_is_lost_while_somebody_waits(hosts: Hosts) -> None:
             pickle.loads(data)
 
 
-# What is refused
+# Refusals
 
 
 class Asker:

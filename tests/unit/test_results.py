@@ -1,4 +1,4 @@
-"""What waits for results, and is interrupted."""
+"""Waits for results, and their interruptions."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from unit.ledger_steps import known
 
 
 class Stop(BaseException):
-    """What a signal's handler raises."""
+    """Exception that a signal's handler raises."""
 
 
 def result() -> ApplyResult:
@@ -163,7 +163,7 @@ def test_whoever_is_interrupted_at_any_step_asks_for_more_the_next_time(
     files = {results.__file__, work_items.__file__}
 
     def take_two(stop: int) -> bool:
-        """Whether it was interrupted, at step ``stop`` of taking the first."""
+        """Return whether it was interrupted, at step ``stop`` of taking the first."""
         asked: set[str] = set()
         found = iterator()
         buffer = found._buffer
@@ -231,7 +231,7 @@ def test_a_map_whose_getting_is_interrupted_at_any_step_raises_its_error_the_nex
     pool: Any = None
 
     def get_twice(stop: int) -> bool:
-        """Whether the first was interrupted, at step ``stop``."""
+        """Return whether the first was interrupted, at step ``stop``."""
         found = MapResult(pool)
         found.add_results(0, [1, outcome, 3], True)
         found.set_done()

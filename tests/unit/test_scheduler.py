@@ -1,4 +1,4 @@
-"""What a pool does next, decision by decision."""
+"""Scheduler's next steps for a pool, decision by decision."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def finish(scheduler: Scheduler, decisions: Decisions, now: float) -> Decisions:
 
 
 def nothing(decisions: Decisions) -> bool:
-    """Whether there is nothing to do, now or later."""
+    """Return whether there is no work, now or later."""
     return decisions == Decisions([], [], 0, [], [], [], math.inf, False)
 
 

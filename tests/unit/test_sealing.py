@@ -118,7 +118,7 @@ def test_secrets_stay_out_of_logs() -> None:
 
 
 def opened(size: int) -> memoryview:
-    """What a connection of its own brings."""
+    """Return the opened message of a separate connection."""
     return Opener(SECRET).open(sealed(Sealer(SECRET), bytes(size)))
 
 

@@ -1,4 +1,4 @@
-"""Which files look like secrets."""
+"""Files that look like secrets."""
 
 from __future__ import annotations
 

@@ -89,7 +89,7 @@ def test_to_notify_fewer_than_none_wakes_nobody() -> None:
 def in_turn(semaphore: Any, inside: Any, times: int) -> None:
     for _ in range(times):
         with semaphore:
-            assert inside.acquire(False)  # nobody else is here
+            assert inside.acquire(False)  # the condition has no other users
             inside.release()
 
 

@@ -124,7 +124,7 @@ def test_what_fiber_adds_has_types_and_mistakes_are_errors(findings: Findings) -
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_every_public_name_has_a_type(tmp_path: Path) -> None:
-    """By pyright's standard, without what it could infer in another way than other checkers do."""
+    """Check by pyright's standard, without inferences that differ between checkers."""
     options = ("--verifytypes", "fiber", "--ignoreexternal", "--outputjson")
     # It looks for the package where the first python of PATH does, and follows no .pth file.
     path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
@@ -170,7 +170,7 @@ def test_init_has_a_typed_keyword_for_each_key() -> None:
         for entry in settings.body
         if isinstance(entry, ast.AnnAssign) and isinstance(entry.target, ast.Name)
     }
-    # What is a path in the configuration may be given as a pathlib.Path.
+    # Paths in the configuration may be given as a pathlib.Path.
     narrowed = {key: text.replace("str | os.PathLike[str]", "str") for key, text in typed.items()}
     narrowed["template"] = narrowed["template"].removesuffix(" | None")
     expected = {entry.name: str(entry.type) for entry in fields(Config)}

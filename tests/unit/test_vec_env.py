@@ -34,7 +34,7 @@ def torch() -> Iterator[None]:
     """torch, or what stands in for it, and is gone afterwards."""
     before = set(sys.modules)
     path = list(sys.path)
-    sys.path.append(str(STAND_INS))  # last: what is installed is found first
+    sys.path.append(str(STAND_INS))  # last: installed packages are found first
     yield
     sys.path[:] = path
     for name in set(sys.modules) - before:
@@ -141,7 +141,7 @@ def test_spaces_that_differ(vec_env: Make) -> None:
 
 def test_spaces_of_the_users_own(vec_env: Make) -> None:
     class Word(spaces.Text):
-        """Of a kind that Gymnasium cannot batch with others."""
+        """Space of a kind that Gymnasium cannot batch with others."""
 
     env = vec_env([partial(Sampling, Word(5))] * 3)
     assert env.observation_space == Word(5)

@@ -77,7 +77,7 @@ def test_an_answer_that_cannot_be_unpickled(
         "an answer of environments 2 to 3, of worker 'VectorEnv-worker-1', cannot be unpickled"
     ]
     assert env.step([0] * 4)[0][3] == [2]
-    # Nobody is waited for who has answered so.
+    # A worker that has answered so is not waited for.
     env.send([0, 0, 1, 0])
     with pytest.raises(error, match="no number"):
         env.recv(4)
@@ -93,7 +93,7 @@ def test_what_its_worker_says_later_is_not_taken_for_the_next_answer(
     makes = [partial(Saying, unreadable), partial(Faulty, gate), Faulty, Faulty]
     env = vector_env(makes, shared_memory=False)
     env.reset()
-    for _ in range(4):  # now it is known that nobody should wait for that one
+    for _ in range(4):  # now it is known that this one need not be waited for
         env.step([0, Faulty.SLOW, 0, 0])
     env.send([1, Faulty.WAIT, 0, 0])
     with pytest.raises(ValueError, match="no number"):
@@ -128,7 +128,7 @@ class Filming(Sampling):
 
 
 def is_its_owners(array: Any) -> bool:
-    """Whether it lies in no memory that its sender has, too."""
+    """Return whether the array lies in memory that its sender does not share."""
     memory = array
     while isinstance(memory, np.ndarray):
         memory = memory.base
@@ -161,7 +161,7 @@ def test_infos_of_types_that_do_not_go_together(vector_env: Make) -> None:
 
 
 class Spaceless(Faulty):
-    """Has no space, or one that cannot be pickled."""
+    """Environment that has no space, or one that cannot be pickled."""
 
     def __init__(self, space: Any = None) -> None:
         super().__init__()
@@ -224,14 +224,14 @@ def test_a_worker_that_dies_in_a_call_names_the_environment(vector_env: Make) ->
 
 
 class Stubborn:
-    """Has a reason of its own why it cannot be pickled."""
+    """Error that cannot be pickled for a special reason."""
 
     def __reduce__(self) -> str:
         raise ValueError("cannot pickle this")
 
 
 class Unpicklable(Faulty):
-    """One of them has what cannot be pickled."""
+    """Environment with an object that cannot be pickled."""
 
     def __init__(self, make: Callable[[], Any]) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""When a worker of a vector environment tells what is done: at once, or with what follows."""
+"""Reports of a worker of a vector environment: at once, or with the next ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How long a learner waits for a worker before it takes it for stuck."""
+"""Limit of a learner's wait for a worker before it takes it for stuck."""
 
 from __future__ import annotations
 

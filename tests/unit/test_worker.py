@@ -25,7 +25,7 @@ from unit import pool_tasks as tasks
 
 
 class Channel:
-    """What the executor would hear."""
+    """Channel that records a worker's messages to the executor."""
 
     def __init__(self) -> None:
         self.said: list[tuple[Any, ...]] = []
@@ -43,7 +43,7 @@ class Channel:
             assert self.arrived.wait_for(lambda: len(self.said) >= count, PATIENCE)
 
     def results(self, seq: int) -> list[Any]:
-        """What the tasks of a batch came to, errors as they are."""
+        """Return the results of a batch's tasks, errors unraised."""
         found: list[Any] = []
         for words, buffers in zip(self.said, self.buffers, strict=True):
             if words[0] != seq:

@@ -1,4 +1,4 @@
-"""How many workers there should be, and when it is no use to try again."""
+"""Number of workers that a pool needs, and when it stops trying."""
 
 from __future__ import annotations
 
@@ -262,7 +262,7 @@ def test_who_dies_at_work_is_replaced_at_once(workers: PoolWorkerSet) -> None:
     assert workers.next_try() is None
 
 
-# What is said
+# Messages
 
 
 def test_failures_that_last_are_told_once_while_one_waits(workers: PoolWorkerSet) -> None:

@@ -1,4 +1,4 @@
-"""What a person can see of a pool's workers, and which resources these get."""
+"""View of a pool's workers, and their resources."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_the_first_function_decides_what_workers_get() -> None:
     resources = WorkerResources(Resources(pool="warm"))
     resources.choose_for(fiber.meta(cpu=2)(square))
     assert resources.chosen == Resources(cpu=2, pool="warm")
-    resources.choose_for(square)  # which wishes nothing
+    resources.choose_for(square)  # which has no wishes
     resources.choose_for(fiber.meta(cpu=2)(square))
     with pytest.raises(ValueError, match="Make another pool"):
         resources.choose_for(fiber.meta(cpu=2, gpu=1)(square))

@@ -156,7 +156,7 @@ def test_a_child_is_started_signalled_and_reaped(master: Master) -> None:
     master.say(zygote.SIGNAL, 7, signal.SIGTERM)
     assert master.hear() == (zygote.EXITED, 7, -signal.SIGTERM)
     assert census.read(pid) is None, "no zombie is left"
-    master.say(zygote.SIGNAL, 7, signal.SIGTERM)  # gone: nothing happens
+    master.say(zygote.SIGNAL, 7, signal.SIGTERM)  # gone: the call does nothing
     assert master.started(8) > 0
 
 
