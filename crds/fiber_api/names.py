@@ -218,6 +218,28 @@ def endpoint_of(address: str) -> str:
 # -- Words of a status
 
 
+# -- Kubernetes' words for the ends of pods
+
+DISRUPTIONS: Final = {
+    "DeletionByPodGC": "NodeLost",
+    "DeletionByTaintManager": "NodeLost",
+    "EvictionByEvictionAPI": "Evicted",
+    "PreemptionByScheduler": "Preempted",
+    # In the status itself, by the kubelet.
+    "Evicted": "Evicted",
+    "NodeLost": "NodeLost",
+    "NodeShutdown": "NodeLost",
+    "Preempting": "Preempted",
+    "Shutdown": "NodeLost",
+    "Terminated": "NodeLost",
+}
+"""Kubernetes' reasons for ending a pod, and the words that Fiber shows for them."""
+
+LOST_CONTAINERS: Final = frozenset({"ContainerStatusUnknown", "Unknown"})
+"""Reasons of containers that a node lost sight of, for example in a restart.  The exit code of such
+a container is made up."""
+
+
 class ConditionType(StrEnum):
     """Types of ``status.conditions``."""
 

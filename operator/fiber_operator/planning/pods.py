@@ -138,21 +138,6 @@ _CANNOT_START = frozenset(
     }
 )
 
-# The cluster's words for a pod that it ended or turned away for reasons of its own.
-_DISRUPTIONS = frozenset(
-    {
-        "Evicted",
-        "NodeLost",
-        "NodeShutdown",
-        "Preempting",
-        "Shutdown",
-        "Terminated",  # by a node that shuts down in good order
-    }
-)
-
-# A runtime that lost sight of a container, as when its node was restarted, makes up an exit code.
-_LOST_CONTAINERS = frozenset({"ContainerStatusUnknown", "Unknown"})
-
 
 class _Observation:
     """Observation of one pod."""
@@ -305,8 +290,8 @@ class _Observation:
         reason, message = text(self._status.get("reason")), text(self._status.get("message"))
         if self._exceeded_own_limit():
             return Trouble.APPLICATION, reason, message
-        lost = text(end.get("reason")) in _LOST_CONTAINERS
-        if self._disruption() or reason in _DISRUPTIONS or lost:
+        lost = text(end.get("reason")) in names.LOST_CONTAINERS
+        if self._disruption() or reason in names.DISRUPTIONS or lost:
             return Trouble.DISRUPTED, *self._disruption_words()
         if reason and not end:
             # The node turned it away (OutOfcpu, UnexpectedAdmissionError, ...).  The next one may
@@ -346,7 +331,7 @@ class _Observation:
         end = self._ending()
         cause = text(end.get("reason"))
         # Else it is the worker's own output, which says nothing of what has ended it.
-        words = text(end.get("message")) if cause in _LOST_CONTAINERS else ""
+        words = text(end.get("message")) if cause in names.LOST_CONTAINERS else ""
         return reason or cause, message or words
 
     # Fields

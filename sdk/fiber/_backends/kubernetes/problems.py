@@ -277,34 +277,14 @@ def _out_of_memory(pod: Mapping[str, Any], worker: Mapping[str, Any], container:
     return f"OOMKilled: its memory limit is {limit}" if limit else "OOMKilled: it has no limit"
 
 
-_DISRUPTIONS = {
-    "DeletionByPodGC": "NodeLost",
-    "DeletionByTaintManager": "NodeLost",
-    "EvictionByEvictionAPI": "Evicted",
-    "PreemptionByScheduler": "Preempted",
-    # In the status itself, by the kubelet.
-    "Evicted": "Evicted",
-    "NodeLost": "NodeLost",
-    "NodeShutdown": "NodeLost",
-    "Preempting": "Preempted",
-    "Shutdown": "NodeLost",
-    "Terminated": "NodeLost",
-}
-"""Kubernetes' reasons for the end of a pod, and the reasons that Fiber reports."""
-
-
 def _disruption(pod: Mapping[str, Any]) -> str | None:
     status = pod.get("status") or {}
     conditions = status.get("conditions") or ()
     for source in (status, *(c for c in conditions if c.get("type") == "DisruptionTarget")):
-        word = _DISRUPTIONS.get(str(source.get("reason")))
+        word = names.DISRUPTIONS.get(str(source.get("reason")))
         if word and source.get("status") != "False":
             return _sentence(word, str(source.get("message") or ""))
     return None
-
-
-_LOST_CONTAINERS = ("ContainerStatusUnknown", "Unknown")
-"""Reasons of containers that a node lost, for example in a restart.  Their exit code is wrong."""
 
 
 def _deletion(pod: Mapping[str, Any]) -> str | None:
@@ -314,7 +294,7 @@ def _deletion(pod: Mapping[str, Any]) -> str | None:
 
 
 def _lost_container(worker: Mapping[str, Any]) -> str | None:
-    lost = worker.get("reason") in _LOST_CONTAINERS
+    lost = worker.get("reason") in names.LOST_CONTAINERS
     return "NodeLost: its node has no record of the container" if lost else None
 
 
@@ -336,7 +316,7 @@ def _sentence(word: str, rest: str) -> str:
 
 def _exitcode(worker: Mapping[str, Any]) -> int | None:
     code = worker.get("exitCode")
-    if not isinstance(code, int) or worker.get("reason") in _LOST_CONTAINERS:
+    if not isinstance(code, int) or worker.get("reason") in names.LOST_CONTAINERS:
         return None
     return 128 - code if code > 128 else code  # runtimes add 128 to a signal
 
