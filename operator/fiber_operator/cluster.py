@@ -44,11 +44,11 @@ __all__ = [
 
 T = TypeVar("T")
 Observer = Callable[[str, str, str, float], None]
-"""Told of each call: verb, resource, HTTP status or what went wrong, seconds."""
+"""Called after each call with verb, resource, HTTP status or kind of failure, and seconds."""
 Permit = Callable[[], float]
 
 PAGE = 500
-"""Objects of a page, where a list is read in pages."""
+"""Objects in a page of a list."""
 
 READ_TIMEOUT = 30.0
 WATCH_SECONDS = 240
@@ -58,7 +58,7 @@ WATCH_TIMEOUT = 300.0
 SILENCE = 90.0
 """Seconds without a byte after which a watch is taken for dead.  A bookmark comes each minute."""
 WRITE_TIMEOUT = 10.0
-"""At most: a write has ended before another operator may begin."""
+"""Longest time of a write, so that it has ended before another operator may begin."""
 CONNECT_TIMEOUT = 5.0
 
 _MERGE_PATCH = "application/merge-patch+json"
@@ -68,14 +68,14 @@ _METADATA = f"{_JSON};as={METADATA_LIST};g=meta.k8s.io;v=v1"
 
 
 class ResourceType(NamedTuple):
-    """A kind of object, as the API's paths name it."""
+    """Type of objects, as the API's paths name it."""
 
     group: str
     version: str
     plural: str
 
     def path(self, namespace: str | None, name: str = "", subresource: str = "") -> str:
-        """The path of one object or, without a name, of all in ``namespace`` (None: in all)."""
+        """Return the path of one object, or without a name of all in ``namespace`` (None: all)."""
         start = f"/apis/{self.group}/{self.version}" if self.group else f"/api/{self.version}"
         scope = f"namespaces/{namespace}" if namespace is not None else ""
         return "/".join(part for part in (start, scope, self.plural, name, subresource) if part)
@@ -98,9 +98,9 @@ async def _document(response: RESTResponse, what: str) -> Body:
 class Cluster:
     """Client of one API server.
 
-    ``permit`` is called before each call that changes something.  It returns how many seconds the
-    call may take, and raises if this process may change nothing now.  ``connections`` bounds
-    the calls under way; namespaces take turns for them.
+    ``permit`` is called before each write.  It returns how many seconds the write may take, and
+    raises if this process may not write now.  ``connections`` limits the calls at the same time;
+    namespaces take turns for them.
     """
 
     def __init__(
@@ -112,8 +112,8 @@ class Cluster:
         observe: Observer = lambda verb, resource, code, seconds: None,
     ) -> None:
         configuration.connection_pool_maxsize = connections
-        # Looking for proxies and .netrc costs two turns of a thread for each call; a proxy that
-        # the API server needs stands in the kubeconfig.
+        # Looking for proxies and .netrc would cost two turns of a thread for each call.  A proxy
+        # for the API server is in the kubeconfig.
         configuration.client_session_kwargs = {"trust_env": False}
         self._client = ApiClient(configuration)
         self._client.user_agent = "fiber-operator"
@@ -126,7 +126,7 @@ class Cluster:
         await self._client.close()
 
     def check_permit(self) -> None:
-        """Raise the error of ``permit`` if this process may change nothing now."""
+        """Raise the error of ``permit`` if this process may not write now."""
         self._permit()
 
     async def read_metadata(self, resource: ResourceType, namespace: str, name: str) -> Body:
@@ -135,14 +135,14 @@ class Cluster:
         return object_of(answer, name, f"get {resource.plural} {name}")
 
     async def read(self, resource: ResourceType, namespace: str, name: str) -> Body:
-        """The object as it is now, not as a cache had it."""
+        """Return the current object, not one from a cache."""
         answer = await self._call("get", resource, namespace, name)
         return object_of(answer, name, f"get {resource.plural} {name}")
 
     async def list_metadata(
         self, resource: ResourceType, namespace: str | None, keep: Callable[[Body], T]
     ) -> list[T]:
-        """Return what ``keep`` makes of each object's metadata, which come in pages."""
+        """Return the results of ``keep`` for each object's metadata, which are read in pages."""
         kept: list[T] = []
 
         def take(item: Body) -> None:
@@ -153,7 +153,7 @@ class Cluster:
         except Unavailable as error:
             if error.status != 410:
                 raise
-            # The next page was asked for too late.  A list without pages cannot be too late.
+            # The request for the next page came too late.  A list without pages cannot be too late.
             kept.clear()
             await self._pages(resource, namespace, take, {}, _METADATA)
         return kept
@@ -253,10 +253,10 @@ class Cluster:
     async def create(
         self, resource: ResourceType, namespace: str, body: Body, *, dry_run: bool = False
     ) -> Body:
-        """Create the object; the answer is what it became.
+        """Create the object, and return it as the API server has stored it.
 
-        A dry run makes nothing and is refused for fields that the API server does not know, which
-        it would else drop in silence.
+        A dry run stores nothing, and is refused for unknown fields, which the API server would
+        otherwise drop in silence.
         """
         query = {"dryRun": "All", "fieldValidation": "Strict"} if dry_run else {}
         answer = await self._call("create", resource, namespace, query=query, body=body)
@@ -270,7 +270,7 @@ class Cluster:
     async def patch(
         self, resource: ResourceType, namespace: str, name: str, patch: Body, subresource: str = ""
     ) -> Body:
-        """A JSON merge patch: None removes a field, a list replaces the list."""
+        """Apply a JSON merge patch: None removes a field, a list replaces a list."""
         answer = await self._call(
             "patch", resource, namespace, name, subresource=subresource, body=patch
         )
@@ -285,7 +285,7 @@ class Cluster:
         uid: str,
         resource_version: str | None = None,
     ) -> None:
-        """Delete this very object; Conflict if another has its name, or it changed since."""
+        """Delete the object with this uid; Conflict if it is another or has changed."""
         preconditions = {"uid": uid, "resourceVersion": resource_version}
         options: Body = {
             "apiVersion": "v1",
@@ -325,7 +325,7 @@ class Cluster:
                 finally:
                     response.response.close()
             except (TimeoutError, aiohttp.ClientError, OSError) as error:
-                # A TimeoutError says nothing of its own.
+                # A TimeoutError has no message.
                 code = "timeout" if isinstance(error, TimeoutError) else "connection"
                 raise Unavailable(str(error) or "no answer in time", what=what) from error
             except Unavailable as error:
@@ -346,7 +346,7 @@ class Cluster:
         headers = {"Accept": accept}
         if body is not None:
             headers["Content-Type"] = _MERGE_PATCH if verb == "patch" else _JSON
-        # Without the body: it is JSON already and need not be walked through for models.
+        # The body is not passed: it is JSON already, and the client would search it for models.
         method, url, headers, _, _ = await self._client.param_serialize(
             _METHODS[verb],
             path,
@@ -373,7 +373,7 @@ _WRITES = {"create", "update", "patch", "delete"}
 
 
 async def load_configuration() -> Configuration:
-    """Load the address of the API server and the login: from KUBECONFIG, else the pod's account."""
+    """Load address and login of the API server from KUBECONFIG, else from the pod's account."""
     configuration = Configuration()
     file = os.environ.get("KUBECONFIG")
     if not file and "KUBERNETES_SERVICE_HOST" in os.environ:
@@ -386,7 +386,7 @@ async def load_configuration() -> Configuration:
 
 
 async def open_session(configuration: Configuration, **options: Any) -> aiohttp.ClientSession:
-    """Open a session that is logged in, for another client; ``options`` are aiohttp's."""
+    """Open a session with this login for another client; ``options`` are aiohttp's."""
     token = await configuration.get_api_key_with_prefix("BearerToken", alias="authorization")
     tls = RESTClientObject(configuration).ssl_context
     return aiohttp.ClientSession(
@@ -401,12 +401,15 @@ async def open_session(configuration: Configuration, **options: Any) -> aiohttp.
 
 
 class NamespaceSemaphore:
-    """``places`` that may be taken at the same time; each further one waits for its turn."""
+    """Semaphore of ``places`` for which namespaces take turns.
+
+    A namespace that wants a thousand places does not make another namespace wait for all of them.
+    """
 
     def __init__(self, places: int) -> None:
         self._free = places
         self._waiting: OrderedDict[str, deque[asyncio.Future[None]]] = OrderedDict()
-        """Waiters by namespace, in the order of their turns."""
+        """Waiting tasks by namespace, in the order of the namespaces' turns."""
 
     @contextlib.asynccontextmanager
     async def take(self, namespace: str) -> AsyncIterator[None]:
@@ -427,7 +430,7 @@ class NamespaceSemaphore:
             await turn
         except asyncio.CancelledError:
             if turn.done() and not turn.cancelled():
-                self._release()  # the place was given just before
+                self._release()  # the place was assigned just before
             raise
 
     def _release(self) -> None:

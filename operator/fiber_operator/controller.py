@@ -58,12 +58,12 @@ log = logging.getLogger(__name__)
 
 
 ENOUGH = 1.0
-"""Seconds that pods are changed for, so that the status is not out of date for long."""
+"""Seconds for which pods are changed, so that the status is not out of date for long."""
 DELETIONS = 50
-"""Pods that are deleted at once."""
+"""Most pods that are deleted at the same time."""
 
 _NO_VERDICTS = ("does not support dry run", QUOTA_IS_FULL)
-"""Refusals of a dry run that say nothing about the template: a webhook's fault, a full quota."""
+"""Words of refusals of a dry run that do not judge the template: an unfit webhook, a full quota."""
 
 RIVAL = (
     "another program wrote this pool's status, probably the operator of another release. Two "
@@ -74,16 +74,16 @@ RIVAL = (
 
 @dataclass
 class PoolMemory:
-    """Memory of one pool between reconciles, by uid.  Losing it costs only calls."""
+    """Memory about one pool between reconciles, by uid.  Its loss only costs calls."""
 
     uid: str
     dependents: Dependents | None = None
     accepted: str | None = None
-    """The template hash that passed the dry run."""
+    """Template hash that passed the dry run."""
     refusal: PodRefusal | None = None
     creation: Obstacle | None = None
     deletion: Obstacle | None = None
-    """Why the last one came to nothing."""
+    """Failure of the last deletion."""
     warnings: dict[str, str] = field(default_factory=dict)
     pace: CreationPace = field(default_factory=CreationPace)
     written: Mapping[str, Any] | None = None
@@ -93,45 +93,45 @@ class PoolMemory:
     told: Mapping[str, Any] = field(default_factory=dict)
     """Status that was written for a pool that the operator does not read."""
     generation: int = -1
-    """Generation of the pool at the last reconcile that did not fail, or the present one."""
+    """Generation of the pool in this reconcile, or in the last one that did not fail."""
 
     @property
     def address(self) -> str | None:
-        """Address that agents dial, once it is known."""
+        """Address that agents dial; None while it is not known."""
         return self.dependents.address if self.dependents else None
 
     def refused(
         self, template_hash: str, error: ApiError, now: float, *, dry_run: bool = False
     ) -> None:
-        """The API server does not take a pod of this template now."""
+        """Note that the API server refuses a pod of this template now."""
         self.creation = None
         before = self.refusal
         count = before.count + 1 if before and before.template_hash == template_hash else 1
         self.refusal = PodRefusal(template_hash, error.status, error.message, now, count, dry_run)
 
     def not_created(self, error: ApiError) -> None:
-        """Note a failed creation, after which it is not known whether the template is good."""
-        # Of a quota that is counted at the same time, which is nobody's trouble, comes a Conflict.
+        """Note a failed creation that says nothing about the template."""
+        # A Conflict comes from a quota that is updated at the same time, and is no problem.
         self.creation = None if isinstance(error, Conflict) else messages.creation_obstacle(error)
 
 
 @dataclass
 class Work:
-    """Pass over a pool: its state, and once it is planned the work to do."""
+    """Pass of a reconcile: the pool, what is known of it, and the plan."""
 
     key: Key
     document: Body
     state: PoolMemory
     creation: Creation
     pool: FiberPool | None = None
-    """None if the spec cannot be read."""
+    """None if the spec is invalid."""
     plan: Plan = field(default_factory=Plan)
 
 
 class Applier:
-    """Carries out plans.  ``now`` gives unix seconds.
+    """Carries out plans.  ``now`` returns unix seconds.
 
-    ``requests`` says what workers request of resources that their template says nothing of.
+    ``requests`` are the workers' requests for resources that their template does not mention.
     """
 
     def __init__(
@@ -154,14 +154,14 @@ class Applier:
         self._requests = requests
 
     async def dry_run(self, pool: FiberPool, plan: Plan, state: PoolMemory) -> ApiError | None:
-        """Ask whether the API server takes a pod of this template; returns what hindered that."""
+        """Send a dry run of a pod; return the error if the call itself failed."""
         name = names.pod_name(pool.metadata.name, self._draw())
         body = podspec.pod(pool, name, state.address or "", self._requests)
         try:
             await self._cluster.create(PODS, pool.metadata.namespace, body, dry_run=True)
         except (Refused, Invalid) as error:
             if any(words in error.message for words in _NO_VERDICTS):
-                # The first pods will show.
+                # The creation of the first pods will judge the template.
                 state.accepted, state.creation = plan.template_hash, None
                 return None
             state.refused(plan.template_hash, error, self._now(), dry_run=True)
@@ -173,7 +173,7 @@ class Applier:
         return None
 
     async def apply(self, work: Work) -> Result:
-        """Do what is planned; the first error that is not part of the game is raised."""
+        """Carry out the plan; the first unexpected error is raised."""
         if work.plan.delete_pool:
             try:
                 await self._delete_pool(work)
@@ -183,12 +183,12 @@ class Applier:
                 raise
             return Result()
         await self._write_status(work)
-        # The status says already what they tell of: they would not be planned again.
+        # Once the status is written, these events are not planned again.
         self._tell(work, work.plan.events)
         return await self._change_pods(work)
 
     def created(self, key: Key, state: PoolMemory, creation: Creation) -> Result:
-        """Remember what came of the creation so far; what follows from it."""
+        """Note the outcome of the creation so far, and return what follows from it."""
         done = creation.take()
         if done.names:
             self._metrics.created(len(done.names))
@@ -196,7 +196,7 @@ class Applier:
             log.info("created %s", _some(done.names), extra=about(*key, uid=state.uid))
         if done.refusal is not None:
             state.refused(creation.order.template_hash, done.refusal, self._now())
-            return Result(requeue_after=0.0)  # so that the status says it
+            return Result(requeue_after=0.0)  # so that the status shows it
         if done.failure is not None:
             state.not_created(done.failure)
             log.warning("%s", done.failure, extra=about(*key, uid=state.uid))
@@ -206,8 +206,8 @@ class Applier:
     async def _write_status(self, work: Work) -> None:
         if work.plan.status is None:
             return
-        # The uid keeps it from a new pool of the same name.  What is written is true whatever has
-        # been changed since the pool was read: it names the generation that it is of.
+        # The uid protects a new pool of the same name.  The status is right even if the pool has
+        # changed since it was read, because it names the generation that it describes.
         patch = {"metadata": {"uid": work.state.uid}, "status": dict(work.plan.status)}
         work.state.written = None
         try:
@@ -235,7 +235,7 @@ class Applier:
                 POOLS, *work.key, uid=work.state.uid, resource_version=version
             )
         except (Gone, Conflict):
-            return  # it was changed meanwhile, by its master perhaps; the next reconcile sees
+            return  # its master may have changed it meanwhile; the next reconcile decides
         self._tell(work, work.plan.events)
 
     async def _change_pods(self, work: Work) -> Result:
@@ -252,9 +252,9 @@ class Applier:
         return Result() if as_planned else Result(requeue_after=GAP)
 
     async def _delete(self, work: Work) -> tuple[int, bool]:
-        """Delete pods; return how many were handled, and whether each was as the plan had it.
+        """Delete pods; return how many were handled, and whether all were as in the plan.
 
-        This stops after a while, so that the status is not out of date for long.
+        It stops after some time, so that the status is not out of date for long.
         """
         key = work.key
         deletions = sorted(work.plan.delete, key=lambda deletion: deletion.may_work)
@@ -263,7 +263,7 @@ class Applier:
         while done < len(deletions) and (not done or clock() < enough):
             batch = deletions[done : done + DELETIONS]
             if batch[-1].may_work and await self._has_changed(work):
-                # A master may have attached since: what was free to go may be at work.
+                # A master may have attached since: these pods may have work.
                 batch = [deletion for deletion in batch if not deletion.may_work]
                 deletions = deletions[:done] + batch
                 as_planned = False
@@ -288,7 +288,7 @@ class Applier:
         return done, as_planned
 
     async def _has_changed(self, work: Work) -> bool:
-        """Tell whether the pool has changed since the plan was made."""
+        """Return True if the pool has changed since the plan was made."""
         try:
             document = await self._cluster.read(POOLS, *work.key)
         except Gone:
@@ -315,7 +315,7 @@ class Applier:
 
 
 def _version(document: Body) -> tuple[object, ...]:
-    """Return a version that changes with all inputs of a plan, and not with the status."""
+    """Return a version that changes with the inputs of a plan, but not with the status."""
     metadata = mapping(document, "metadata")
     return tuple(metadata.get(key) for key in ("uid", "generation", "deletionTimestamp"))
 
@@ -328,13 +328,13 @@ def _some(pods: list[str]) -> str:
 # -- Reconcile
 
 LONGEST = 60.0
-"""Seconds for which one reconcile goes on while pods are being created."""
+"""Longest time in seconds of one reconcile while pods are being created."""
 OBSTRUCTED = 5.0
-"""Seconds until a pool that lacks something other than pods is looked at again."""
+"""Seconds until the next reconcile of a pool with an obstacle."""
 
 
 class Controller:
-    """Reconciles pools.  One at a time of a pool; different pools at the same time."""
+    """Reconciles pools: each pool once at a time, different pools at the same time."""
 
     def __init__(
         self,
@@ -367,17 +367,17 @@ class Controller:
         self._states: dict[Key, PoolMemory] = {}
 
     def is_news(self, key: Key, uid: str, generation: int) -> bool:
-        """Tell whether a reconcile would see another spec than the last one did."""
+        """Return True if a reconcile would see another spec than the last one."""
         state = self._states.get(key)
         return state is None or state.uid != uid or state.generation != generation
 
     def forget(self) -> None:
-        """Remember nothing: another operator may have acted meanwhile."""
+        """Forget all pools, because another operator may have acted meanwhile."""
         for key in list(self._states):
             self._drop(key)
 
     async def reconcile(self, key: Key) -> Result:
-        """Work at the pool and do what is to be done; never raises what the API server causes."""
+        """Reconcile the pool.  Errors of the API server are handled here."""
         started = time.perf_counter()
         outcome, result = "error", Result(failed=True)
         try:
@@ -396,7 +396,7 @@ class Controller:
         return result
 
     async def _reconcile(self, key: Key) -> Result:
-        """Make one pass, and more passes while pods are being created."""
+        """Make a pass, and further passes while pods are being created."""
         found = await self._read(key)
         if found is None:
             return Result(forget=True)
@@ -433,7 +433,7 @@ class Controller:
         return Result(requeue_after=0.0)
 
     async def _read(self, key: Key) -> tuple[Body, PoolMemory] | None:
-        """The pool as it is now, and what is remembered of it."""
+        """Return the pool as it is now, and the memory about it; None if it is gone."""
         try:
             document, oversized = await self._document(key)
         except Gone:
@@ -445,7 +445,8 @@ class Controller:
         state = self._states.get(key)
         if state is None or state.uid != uid:
             state = self._states[key] = PoolMemory(uid)
-        # Events about this very spec, our own status among them, are no news while this lasts.
+        # During the reconcile, events about this generation are no news; writes of the status cause
+        # such events.
         state.generation = whole(mapping(document, "metadata").get("generation"))
         state.oversized = oversized
         if oversized:
@@ -480,7 +481,7 @@ class Controller:
         pods = await self._pods(work)
         plan = self._plan(work.key, pool, pods, state)
         if plan.inspect:
-            # Not added to: what is not asked about any more may be over.
+            # Replaces the earlier warnings: those of other pods may be over.
             state.warnings = await pod_warnings(self._cluster, work.key, plan.inspect, pods)
         if plan.dry_run:
             failure = await self._applier.dry_run(pool, plan, state) or failure
@@ -555,7 +556,7 @@ def _master_lease(pool: FiberPool) -> MasterLease | None:
 
 
 def _together(result: Result, made: Result, waited: float) -> Result:
-    """Combine the results of a pass and of the creation that it ``waited`` for."""
+    """Combine the results of a pass and of a creation that was ``waited`` for."""
     after = made.requeue_after
     if after is None and result.requeue_after is not None:
         after = max(0.0, result.requeue_after - waited)

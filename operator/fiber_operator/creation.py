@@ -35,13 +35,14 @@ def draw_suffix() -> str:
 
 @dataclass
 class CreationPace:
-    """Pace of creation of a pool so far, for its next batch."""
+    """Pace of a pool's creations, which its next creation continues."""
 
     batch: int = 1
-    """Number of pods that may be created at once."""
+    """Number of pods in the next batch."""
     unsure: list[str] = field(default_factory=list)
-    """Names of pods of which it is not known whether they were created.  They are used first: one
-    that exists after all is refused as a duplicate, so none is created twice."""
+    """Names of pods that may or may not have been created.
+
+    They are used first: a pod that exists is refused as a duplicate, so none is created twice."""
 
 
 @dataclass(frozen=True)
@@ -50,9 +51,9 @@ class Order:
 
     template_hash: str
     body: Callable[[str], Body]
-    """The pod of that name."""
+    """Function that returns the body of the pod of that name."""
     limit: int
-    """Number of pods that may be created at once."""
+    """Most pods in a batch."""
 
 
 @dataclass
@@ -61,9 +62,9 @@ class Created:
 
     names: list[str] = field(default_factory=list)
     refusal: ApiError | None = None
-    """403 or 422: the first one."""
+    """First error with status 403 or 422."""
     failure: ApiError | None = None
-    """First of the other errors."""
+    """First other error."""
     wait: float = 0.0
     """Seconds that the API server asked to wait."""
 
@@ -90,7 +91,7 @@ class Creation:
         self._draw = draw
         self.order: Order
         self._left = 0
-        """Pods that are still to be begun."""
+        """Number of pods whose creation has not begun."""
         self._under_way: set[str] = set()
         self._unknown = 0
         """Pods that were begun and that were not among those of the last ``see``."""
@@ -111,11 +112,11 @@ class Creation:
             self._task = asyncio.create_task(self._run(), name=f"creation for {self._key}")
 
     def stop(self) -> None:
-        """Begin no further batch."""
+        """Start no further batch."""
         self._left = 0
 
     async def wait(self, seconds: float | None = None) -> bool:
-        """Until there is nothing more to do, or for so long; whether there is not."""
+        """Wait until the creation has ended, at most for ``seconds``; return True if it has."""
         if self._task is None:
             return True
         done, _ = await asyncio.wait([self._task], timeout=seconds)
@@ -125,12 +126,12 @@ class Creation:
         return bool(done)
 
     def take(self) -> Created:
-        """Take the outcome since the last call."""
+        """Return the outcome since the last call."""
         done, self._done = self._done, Created()
         return done
 
     async def cancel(self) -> None:
-        """End it at once; of what is under way nobody knows whether it was created."""
+        """Stop at once.  Pods under way may or may not be created."""
         if self._task is not None:
             self._task.cancel()
             await asyncio.gather(self._task, return_exceptions=True)
@@ -180,5 +181,5 @@ class Creation:
         except Conflict as error:
             if error.reason != "AlreadyExists":
                 raise
-        # It was created before, and the answer was lost.
+        # An earlier request created the pod, and its response was lost.
         return await self._cluster.read(PODS, namespace, name)

@@ -28,29 +28,30 @@ CHECK_INTERVAL = 50.0
 
 @dataclass(frozen=True)
 class Dependents:
-    """Dependents that were found or made."""
+    """State of a pool's dependents after they were checked."""
 
     address: str | None
     """``host:port`` of the Service."""
     obstacles: tuple[Obstacle, ...]
     master: MasterSpec | None
     """Master that the EndpointSlice leads to."""
-    looked: float
+    checked: float
+    """Time of the last complete check."""
     credentials: bool
-    """The Secret is the pool's own and whole, or it is not the operator's."""
+    """True if the Secret belongs to the pool and has a valid key, or is the user's."""
     credentials_made: float = 0.0
-    """Time at which the Secret was made, as the cluster says; 0.0 if that is not known."""
+    """Creation time of the Secret; 0.0 if it is not known."""
     budget: int | None = None
-    """Value of the PodDisruptionBudget; None: there is none, 0: not known."""
+    """Value of the PodDisruptionBudget.  None: there is none.  0: not known."""
     failure: ApiError | None = None
-    """A call that nobody knows the outcome of: to be raised once it is told."""
+    """Error of a call with an unknown outcome, to be raised after the status was written."""
 
 
 @dataclass(frozen=True)
 class _Found:
     """Outcome of one step."""
 
-    told: str | None = None
+    value: str | None = None
     """Address of the Service, or creation time of the Secret."""
     obstacle: Obstacle | None = None
     failure: ApiError | None = None
@@ -66,31 +67,31 @@ class _Obstructed(Exception):
 
 
 class DependentsReconciler:
-    """Makes and mends them.  ``now`` gives unix seconds."""
+    """Creates and repairs the dependents of pools.  ``now`` returns unix seconds."""
 
     def __init__(self, cluster: Cluster, now: Callable[[], float]) -> None:
         self._cluster = cluster
         self._now = now
 
     async def ensure(self, pool: FiberPool, known: Dependents | None) -> Dependents:
-        """Make what is missing; ``known`` is the result of the last call for the pool.
+        """Create what is missing; ``known`` is the result of the last call for the pool.
 
-        What fails is an obstacle and not raised, but for a Conflict: then the next look finds out
-        what there is.
+        A failure becomes an obstacle.  Only a Conflict is raised: the next reconcile then finds out
+        what exists.
         """
         name = pool.metadata.name
         steps: list[tuple[str, _Step]] = [
             (f"the EndpointSlice {names.endpoint_slice_name(name)}", self._slice)
         ]
-        fresh = known is not None and self._now() - known.looked < CHECK_INTERVAL
+        fresh = known is not None and self._now() - known.checked < CHECK_INTERVAL
         complete = known is None or not fresh or bool(known.obstacles)
         if known is not None and not complete:
             if (known.master, known.budget) == (pool.spec.master, pool.spec.min_available):
                 return known
-            address, made, looked = known.address, known.credentials_made, known.looked
+            address, made, checked = known.address, known.credentials_made, known.checked
             whole = known.credentials
         else:
-            address, made, looked = None, 0.0, self._now()
+            address, made, checked = None, 0.0, self._now()
             whole = False
             steps += [
                 (f"the Service {names.service_name(name)}", self._service),
@@ -101,7 +102,7 @@ class DependentsReconciler:
             steps.append((f"the PodDisruptionBudget {names.budget_name(name)}", self._budget))
         found = await _all(*(self._attempt(pool, *step) for step in steps))
         if complete:
-            address, made = found[1].told, seconds(found[2].told)
+            address, made = found[1].value, seconds(found[2].value)
             whole = found[2].obstacle is None
         led = found[0].obstacle is None
         before = known.master if known is not None else None
@@ -109,7 +110,7 @@ class DependentsReconciler:
             address,
             tuple(step.obstacle for step in found if step.obstacle is not None),
             pool.spec.master if led else before,
-            looked,
+            checked,
             whole,
             made,
             0 if budgeted and found[-1].obstacle is not None else pool.spec.min_available,
@@ -141,24 +142,24 @@ class DependentsReconciler:
             identity.key_in(mapping(existing, "data"))
         except identity.InvalidKey as error:
             message = (
-                f"the Secret {name} cannot serve: {error}. Delete it: the operator makes a new "
-                "one. Then restart the master and the workers, which hold the old ones."
+                f"the Secret {name} has no valid key: {error}. Delete it: the operator makes a new "
+                "one. Then restart the master and the workers, which hold the old key."
             )
             raise _Obstructed(Obstacle(Reason.INVALID_CREDENTIALS, message, True)) from None
         return text(mapping(existing, "metadata").get("creationTimestamp"))
 
     async def _check_brought(self, pool: FiberPool, name: str) -> None:
-        """Refuse a Secret that is another pool's."""
+        """Refuse a Secret that belongs to another pool."""
         try:
             existing = await self._cluster.read(SECRETS, pool.metadata.namespace, name)
         except Gone:
-            return  # pods wait for it
+            return  # the pods wait for it
         if (other := manifests.other_owner(pool, existing)) is not None:
             message = (
                 f"spec.credentialsSecretName is {name}, which is the Secret of the FiberPool "
-                f"{other}: its workers could pose as those of {other}. Leave credentialsSecretName "
+                f"{other}. The workers could pose as those of {other}. Leave credentialsSecretName "
                 "out, so that the operator makes a Secret, or name one that belongs to no other "
-                "pool. The field cannot be changed: make the pool anew."
+                "pool. The field cannot be changed, so make the pool anew."
             )
             raise _Obstructed(Obstacle(Reason.INVALID_CREDENTIALS, message, True))
 
@@ -173,7 +174,7 @@ class DependentsReconciler:
         host = spec.get("clusterIP")
         if not isinstance(host, str) or host in ("", "None"):
             message = (
-                f"the Service {name} has no cluster IP, which agents dial. Delete it: the operator "
+                f"the Service {name} has no cluster IP for agents to dial. Delete it: the operator "
                 "makes a new one."
             )
             raise _Obstructed(Obstacle(Reason.NAME_TAKEN, message, True))
@@ -181,9 +182,9 @@ class DependentsReconciler:
         return ",".join(names.address_of(one, names.MASTER_PORT) for one in hosts)
 
     async def _have_service(self, pool: FiberPool, name: str, wanted: Body) -> Body:
-        """Make one that was deleted with its old addresses if they are free: workers dial these."""
+        """Return the Service, created if needed with its former addresses, which workers dial."""
         if addresses := _former_addresses(pool):
-            # A second address would be another place to dial than what workers were given.
+            # A second address would be one that existing workers do not know.
             policy = "PreferDualStack" if len(addresses) > 1 else "SingleStack"
             again = {
                 "clusterIP": addresses[0],
@@ -194,7 +195,7 @@ class DependentsReconciler:
             try:
                 return await self._have(pool, SERVICES, name, lambda: former)
             except Invalid:
-                pass  # somebody has it now
+                pass  # another Service has the address now
         return await self._have(pool, SERVICES, name, lambda: wanted)
 
     async def _slice(self, pool: FiberPool) -> None:
@@ -225,7 +226,7 @@ class DependentsReconciler:
         try:
             existing = await self._cluster.read(BUDGETS, namespace, name)
         except (Gone, Refused):
-            return  # without the right to read one, none was made
+            return  # without the right to read one, the operator has made none
         if manifests.is_ours(pool, existing):
             uid = str(mapping(existing, "metadata").get("uid"))
             await self._cluster.delete(BUDGETS, namespace, name, uid=uid)
@@ -233,10 +234,10 @@ class DependentsReconciler:
     async def _have(
         self, pool: FiberPool, resource: ResourceType, name: str, new: Callable[[], Body]
     ) -> Body:
-        """The object of this name, made if there is none; obstructed if it is another's."""
+        """Return the object of this name, created if needed; raise if it is not the pool's."""
         namespace = pool.metadata.namespace
         if pool.status.endpoint is None:
-            # A pool of which nothing is told yet has none, as a rule.
+            # A pool without a status usually has no objects yet.
             try:
                 return await self._cluster.create(resource, namespace, new())
             except Conflict as error:
@@ -245,7 +246,7 @@ class DependentsReconciler:
         try:
             existing = await self._cluster.read(resource, namespace, name)
         except Gone:
-            # A Conflict: it was made between the two calls; the next look finds out by whom.
+            # A Conflict means that it was created between the two calls.
             return await self._cluster.create(resource, namespace, new())
         if not manifests.is_ours(pool, existing):
             raise _Obstructed(_taken(pool, resource, name, existing))
@@ -253,10 +254,10 @@ class DependentsReconciler:
 
 
 def _concerns_budget(pool: FiberPool, known: Dependents | None) -> bool:
-    """Tell whether the pool has a PodDisruptionBudget, should have one, or may have one."""
+    """Return True if the pool has or should have a PodDisruptionBudget, or may have one."""
     if pool.spec.min_available is not None:
         return True
-    # A pool of which nothing is told yet has none.
+    # A pool without a status has none yet.
     return pool.status.endpoint is not None if known is None else known.budget is not None
 
 
@@ -271,9 +272,9 @@ async def _all(*steps: Awaitable[_Found]) -> list[_Found]:
 
 
 def _former_addresses(pool: FiberPool) -> list[str]:
-    """Return the IP addresses in ``status.endpoint``; none if its Service must have others.
+    """Return the IP addresses in ``status.endpoint``; none if they do not suit the master.
 
-    The Service of one family that an older operator made leads to no master of the other.
+    A Service with one IP family cannot lead to a master with the other.
     """
     endpoint = (pool.status.endpoint or "").removeprefix(f"{names.ENDPOINT_SCHEME}://")
     try:
@@ -309,7 +310,7 @@ def _taken(pool: FiberPool, resource: ResourceType, name: str, existing: Body) -
         )
     return Obstacle(
         Reason.NAME_TAKEN,
-        f"there is a {what} that is not this pool's, and the pool needs the name. Delete or "
-        "rename it, or give the pool another name.",
+        f"there is a {what} that does not belong to this pool, and the pool needs the name. "
+        "Delete or rename it, or give the pool another name.",
         terminal=True,
     )

@@ -37,20 +37,20 @@ log = logging.getLogger(__name__)
 WINDOW = 600.0
 PAUSE = 30.0
 REMEMBERED = 200
-"""Events of a namespace of which repetitions are counted."""
+"""Most events of a namespace whose repetitions are counted."""
 WAITING = 50
-"""Events of a namespace that wait to be posted; beyond that the oldest are given up."""
+"""Most events of a namespace that wait to be posted; beyond that the oldest are dropped."""
 AT_ONCE = 4
-"""Events that are posted at the same time, each of another namespace."""
+"""Most events that are posted at the same time, each of another namespace."""
 MESSAGE_LIMIT = 1024
-"""The API server refuses longer ones."""
+"""Longest message that the API server accepts."""
 
 
 @dataclass
 class _Posted:
     name: str
     first: float
-    told: float
+    updated: float
     count: int = 1
 
 
@@ -60,7 +60,7 @@ _Place = tuple[str, str, str]
 
 @dataclass
 class _Namespace:
-    """The events of one namespace."""
+    """Events of one namespace."""
 
     waiting: deque[tuple[Key, str, PoolEvent]] = field(
         default_factory=lambda: deque(maxlen=WAITING)
@@ -69,7 +69,7 @@ class _Namespace:
     posting: bool = False
 
     def forget(self, now: float) -> None:
-        """Forget what is too old to be repeated, and the oldest of too many."""
+        """Forget events that are too old to be repeated, and the oldest of too many."""
         while self.posted:
             oldest = next(iter(self.posted.values()))
             if len(self.posted) <= REMEMBERED and now - oldest.first <= WINDOW:
@@ -78,7 +78,7 @@ class _Namespace:
 
 
 class EventRecorder:
-    """Posts events.  ``now`` gives unix seconds."""
+    """Posts events on pools.  ``now`` returns unix seconds."""
 
     def __init__(self, cluster: Cluster, now: Callable[[], float], identity: str) -> None:
         self._cluster = cluster
@@ -89,14 +89,14 @@ class EventRecorder:
         """Namespaces in the order of their turns."""
 
     def tell(self, key: Key, uid: str, event: PoolEvent) -> None:
-        """Log ``event`` and have it posted on the pool when its turn comes."""
+        """Log ``event``, and queue it to be posted on the pool."""
         level = logging.WARNING if event.type == "Warning" else logging.INFO
         log.log(level, "%s", event.message, extra=about(*key, uid=uid, reason=event.reason))
         self._events_of(key).waiting.append((key, uid, event))
         self._bell.set()
 
     async def run(self) -> None:
-        """Post what was told, until cancelled."""
+        """Post queued events until cancelled."""
         async with asyncio.TaskGroup() as posters:
             for _ in range(AT_ONCE):
                 posters.create_task(self._post_in_turn())
@@ -108,7 +108,7 @@ class EventRecorder:
                 self._bell.clear()
                 await self._bell.wait()
                 continue
-            # It goes to the end of the line.
+            # The namespace goes to the end of the queue.
             events = self._namespaces[name] = self._namespaces.pop(name)
             events.posting = True
             try:
@@ -119,7 +119,7 @@ class EventRecorder:
             self._forget(name)
 
     def _next(self) -> str | None:
-        """The namespace whose turn it is, if there is one with events that wait."""
+        """Return the namespace whose turn it is; None if no event waits."""
         free = (
             name
             for name, events in self._namespaces.items()
@@ -131,7 +131,7 @@ class EventRecorder:
         return self._namespaces.setdefault(key.namespace, _Namespace())
 
     def _forget(self, name: str) -> None:
-        """Forget what is too old here and in the namespace that waits longest for its turn."""
+        """Forget old events of this namespace and of the one that waits longest for its turn."""
         for known in (name, next(iter(self._namespaces))):
             events = self._namespaces[known]
             events.forget(self._now())
@@ -140,7 +140,7 @@ class EventRecorder:
                 return
 
     async def record(self, key: Key, uid: str, event: PoolEvent) -> None:
-        """Post ``event`` on the pool; it never fails, it only may not be posted."""
+        """Post ``event`` on the pool.  A failure is only logged."""
         now, place = self._now(), (uid, event.reason, event.message[:MESSAGE_LIMIT])
         posted = self._events_of(key).posted.get(place)
         try:
@@ -183,8 +183,8 @@ class EventRecorder:
 
     async def _repeat(self, posted: _Posted, key: Key, now: float) -> None:
         posted.count += 1
-        if now - posted.told >= PAUSE:
-            posted.told = now
+        if now - posted.updated >= PAUSE:
+            posted.updated = now
             patch = {"count": posted.count, "lastTimestamp": _stamp(now)}
             await self._cluster.patch(EVENTS, key.namespace, posted.name, patch)
 
@@ -198,27 +198,27 @@ def _stamp(now: float) -> str:
 
 _NO_NEWS = frozenset(
     {
-        # Said before it had a node.
+        # From before the pod had a node.
         "FailedScheduling",
         "NotTriggerScaleUp",
         "Scheduled",
         "TriggeredScaleUp",
-        # Normal events that go along with a trouble and do not end it.
+        # Normal events that accompany a problem and do not end it.
         "BackOff",
         "Killing",
         "SandboxChanged",
-        # A notice of a kubelet that starts the pod all the same.
+        # A notice of the kubelet, which starts the pod anyway.
         "MissingClusterDNS",
     }
 )
-"""Reasons of events that say nothing of what a pod with a node waits for."""
+"""Reasons of events that do not say what a pod with a node waits for."""
 
 
-class _Said(NamedTuple):
-    """Event; the greatest is the newest."""
+class _Occurrence(NamedTuple):
+    """Event about a pod.  The greatest is the newest."""
 
     second: int
-    """Kubernetes tells most times no better than that."""
+    """Second of the event: most times in Kubernetes are no more precise."""
     written: int
     warning: str
 
@@ -226,35 +226,34 @@ class _Said(NamedTuple):
 async def pod_warnings(
     cluster: Cluster, key: Key, pods: Sequence[str], there: Sequence[PodView]
 ) -> dict[str, str]:
-    """Pod name -> its newest event as ``Reason: message`` if that is a Warning, else empty.
+    """Return the newest event of each pod as ``Reason: message`` if it is a Warning, else "".
 
-    A Warning that something newer follows is over: the volume is mounted at last, the image is
-    being pulled.
+    A Warning that a newer event follows is over: the volume is mounted, or the image is pulled.
     """
     uids = {pod.name: pod.uid for pod in there}
     found = {}
     for name in pods:
         try:
             events = await cluster.list(
-                EVENTS, key.namespace, _said, fields=f"involvedObject.uid={uids.get(name)}"
+                EVENTS, key.namespace, _occurrence, fields=f"involvedObject.uid={uids.get(name)}"
             )
         except ApiError:
-            events = []  # it would only have been an explanation
+            events = []  # the explanation is optional
         newest = max((event for event in events if event is not None), default=None)
         found[name] = newest.warning if newest else ""
     return found
 
 
-def _said(event: Body) -> _Said | None:
+def _occurrence(event: Body) -> _Occurrence | None:
     reason = text(event.get("reason"))
     if reason in _NO_NEWS:
         return None
     warning = f"{reason}: {text(event.get('message'))}" if event.get("type") == "Warning" else ""
-    return _Said(int(_last_time(event)), _version(event), warning)
+    return _Occurrence(int(_last_time(event)), _version(event), warning)
 
 
 def _version(event: Body) -> int:
-    """Return a number that is greater for the later of two events of one second."""
+    """Return a number that is greater for the later of two events in one second."""
     try:
         return int(text(mapping(event, "metadata").get("resourceVersion")))
     except ValueError:
@@ -262,7 +261,7 @@ def _version(event: Body) -> int:
 
 
 def _last_time(event: Body) -> float:
-    """Return when an event happened last: a repeated one is the same object with another time."""
+    """Return the time of the event's last repetition."""
     stamps = (
         mapping(event, "series").get("lastObservedTime"),
         event.get("lastTimestamp"),

@@ -32,21 +32,21 @@ _MESSAGE_LIMIT = 2000
 
 
 class ApiError(Exception):
-    """A call that did not succeed.  ``str`` says what was asked and what came back."""
+    """Failed call.  ``str`` names the call and what went wrong."""
 
     def __init__(self, message: str, *, what: str = "", status: int = 0, reason: str = "") -> None:
         super().__init__(f"{what}: {message}" if what else message)
         self.message = message
-        """The API server's own words."""
+        """Words of the API server."""
         self.call = " ".join(what.split()[:2])
-        """Verb and resource, as a right names them: ``get secrets``."""
+        """Verb and resource as in a right: ``get secrets``."""
         self.status = status
         self.reason = reason
-        """The API server's word for the error, ``AlreadyExists`` for example."""
+        """API server's word for the error, for example ``AlreadyExists``."""
 
     @property
     def writes(self) -> bool:
-        """True if the call changes something, and so passes admission webhooks."""
+        """True if the call changes an object and therefore passes admission webhooks."""
         return not self.call.startswith(("get ", "list ", "watch "))
 
     def again(self) -> ApiError:
@@ -57,27 +57,27 @@ class ApiError(Exception):
 
 
 class Gone(ApiError):
-    """The object does not exist."""
+    """Error of an object that does not exist."""
 
 
 class Conflict(ApiError):
-    """The name is taken, or the object is not the one that was meant."""
+    """Error of a name that is taken, or of a precondition that does not hold."""
 
 
 class Refused(ApiError):
-    """A quota, a policy or a missing right forbids it."""
+    """Error of a call that a quota, a policy or a missing right forbids."""
 
 
 class Invalid(ApiError):
-    """The API server cannot accept this, now or later."""
+    """Error of a call that the API server will never accept."""
 
 
 class Unavailable(ApiError):
-    """The call had no answer, and may have been carried out."""
+    """Error of a call without a valid response, which may have been carried out."""
 
 
 class TooMany(Unavailable):
-    """The API server asks to come back after ``retry_after`` seconds."""
+    """Error of a call that may be retried after ``retry_after`` seconds."""
 
     def __init__(self, message: str, *, retry_after: float, **about: Any) -> None:
         super().__init__(message, **about)
@@ -89,7 +89,7 @@ class Oversized(ApiError):
 
 
 def complaint(error: ApiError) -> str:
-    """Return what went wrong, and what to do if that is known."""
+    """Return the words of an error, and the remedy if it is known."""
     if isinstance(error, Refused):
         return f"{error}. Give the operator's account this right: the chart's roles have it"
     return str(error)
@@ -101,7 +101,7 @@ memory of their JSON; a long template has some hundred."""
 
 
 def object_of(answer: Body, name: str, what: str) -> Body:
-    """``answer`` if it is the object of that name: what is none must not be taken for one."""
+    """Return ``answer`` if it is the object of that name; raise ``Unavailable`` otherwise."""
     metadata = answer.get("metadata")
     if not isinstance(metadata, dict) or metadata.get("name") != name:
         raise Unavailable(f"the answer is not the object {name}", what=what)
@@ -109,7 +109,7 @@ def object_of(answer: Body, name: str, what: str) -> Body:
 
 
 def document_of(status: int, headers: Mapping[str, str], data: bytes, what: str) -> Body:
-    """The document in an answer; what is no success is raised."""
+    """Return the document in a response; raise ``ApiError`` if the response is no success."""
     # Each value but the first of its list or object has a comma before it.
     if data.count(b",") + data.count(b"[") + data.count(b"{") > MOST_VALUES:
         raise Oversized(f"it has more than {MOST_VALUES} values", what=what, status=status)
@@ -120,7 +120,7 @@ def document_of(status: int, headers: Mapping[str, str], data: bytes, what: str)
     if 200 <= status < 300:
         if isinstance(body, dict):
             return body
-        # Not shown: it may be half a Secret.
+        # The data are not shown: they may be part of a Secret.
         raise Unavailable(f"the answer is no JSON object ({len(data)} bytes)", what=what)
     raise _error(status, headers, body if isinstance(body, dict) else {}, data, what)
 
@@ -150,7 +150,7 @@ def _error(status: int, headers: Mapping[str, str], body: Body, data: bytes, wha
     message = message[:_MESSAGE_LIMIT]
     if status == 429:
         return TooMany(message, retry_after=_retry_after(headers), **about)
-    # Without a Status it was not the API server that answered but something on the way to it.
+    # A response without a Status comes from a proxy, not from the API server.
     if status >= 500 or status in (401, 408, 410) or body.get("kind") != "Status":
         return Unavailable(message, **about)
     return {404: Gone, 409: Conflict, 403: Refused}.get(status, Invalid)(message, **about)
@@ -171,7 +171,7 @@ def _excerpt(data: bytes) -> str:
 # -- Lists
 
 PIECE = 2**16
-"""Bytes that are read at least before others may go on: some 16 pods."""
+"""Bytes that are read before other tasks may run: about 16 pods."""
 METADATA = "PartialObjectMetadata"
 METADATA_LIST = f"{METADATA}List"
 
@@ -180,10 +180,10 @@ _decode = json.JSONDecoder().raw_decode
 
 
 class ListReader:
-    """The answer to a list.  Iterate over its objects first, then ask ``more``.
+    """Reader of a list response.  Iterate over its objects first, then call ``more``.
 
-    Strict, because a list that is taken for empty by mistake makes the operator create pods: an
-    answer that is not a whole list of objects raises Unavailable, at its end at the latest.
+    A response that is not a complete list of objects raises ``Unavailable``, at its end at the
+    latest.  A list that is wrongly taken for empty would make the operator create pods.
     """
 
     def __init__(self, pieces: AsyncIterator[bytes], what: str) -> None:
@@ -195,17 +195,17 @@ class ListReader:
         self._ended = False
         self._items: object = None
         self.rest: Body = {}
-        """The members of the list beside its items."""
+        """Members of the list document except its items."""
 
     async def __aiter__(self) -> AsyncIterator[Body]:
         try:
             async for item in self._objects():
                 yield item
         except (ValueError, RecursionError):
-            # Not shown: it may be half a Secret.
+            # The data are not shown: they may be part of a Secret.
             raise Unavailable("the answer is no JSON object", what=self._what) from None
         kind = str(self.rest.get("kind", ""))
-        # The API server has null for the items of an empty list of metadata.
+        # The API server sends null as the items of an empty list of metadata.
         has_items = self._items is list or (kind == METADATA_LIST and "items" in self.rest)
         if not (
             kind.endswith("List") and has_items and isinstance(self.rest.get("metadata"), dict)
@@ -238,7 +238,7 @@ class ListReader:
             raise ValueError("more than one document")
 
     async def _parts(self, start: str, end: str) -> AsyncIterator[None]:
-        """Yield once for each part between the brackets; the caller reads the part."""
+        """Yield once for each part between the brackets; the caller reads that part."""
         await self._take(start)
         if await self._peek() == end:
             await self._take(end)
@@ -260,12 +260,12 @@ class ListReader:
                     raise
                 continue
             if end == len(self._text) and first not in '{["' and await self._read_on():
-                continue  # half a number is a number
+                continue  # the rest of a number may follow
             self._at = end
             return value
 
     async def _peek(self) -> str:
-        """Return the next character that is no space; empty at the end."""
+        """Return the next character that is no space; an empty string at the end."""
         while True:
             space = _SPACE.match(self._text, self._at)
             self._at = space.end() if space else self._at
@@ -278,7 +278,10 @@ class ListReader:
         self._at += 1
 
     async def _read_on(self) -> bool:
-        """Read as much again as is left of the text, so that a large object is tried few times."""
+        """Read as much as the text already holds, so that a large object is tried few times.
+
+        Return False at the end of the response.
+        """
         if self._ended:
             return False
         await asyncio.sleep(0)

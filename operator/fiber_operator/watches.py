@@ -7,7 +7,7 @@ when they fail.  So all handlers are ``on.event`` handlers, which put the name o
 queue or report that a Lease has changed.
 
 kopf takes over the event loop that it runs in and cancels the tasks it finds there, so it has a
-thread with a loop of its own.  When kopf ends, for example because of a garbled response or a
+separate thread and loop.  When kopf ends, for example because of a garbled response or a
 deleted resource type, it is started again as soon as the pools can be listed.
 
 The watches ask for the metadata of objects only.  Of each listed object only the fields that the
@@ -196,8 +196,8 @@ Notice = Callable[[Key, str, int], None]
 """Called with a pool that changed: its key, uid and generation (-1: it is deleted)."""
 
 Renewed = Callable[[str, str, str, int | None], None]
-"""Told of a Lease of a pool: its namespace, name, resourceVersion (empty: it is deleted), and how
-many agents its master has."""
+"""Called with the namespace, name and resourceVersion of a Lease (empty: deleted), and with the
+number of its master's agents."""
 
 Configure = Callable[[], Awaitable[Configuration]]
 """Function that returns address and login.  It is called again when a login has expired."""
@@ -272,7 +272,7 @@ def kopf_settings() -> kopf.OperatorSettings:
     settings.networking.error_backoffs = _Patience()
     settings.networking.request_timeout = 30
     settings.networking.connect_timeout = 5
-    # The server ends a watch in time; where it does not, or says nothing at all, we do.
+    # The server ends a watch in time; if it does not, or is silent, the client does.
     settings.watching.server_timeout = 240
     settings.watching.client_timeout = 300
     settings.watching.connect_timeout = 5
@@ -384,7 +384,7 @@ async def _unless(stop: asyncio.Event, awaitable: Awaitable[None]) -> None:
 
 
 class KopfThread:
-    """``watch`` in a thread of its own; what it tells arrives in the loop that made this."""
+    """Thread that runs ``watch``.  Its callbacks run in the loop that made this object."""
 
     def __init__(
         self,
@@ -472,7 +472,7 @@ class KopfThread:
         try:
             self._home.call_soon_threadsafe(function, *arguments)
         except RuntimeError:
-            pass  # the operator is ending: nobody wants to know any more
+            pass  # the operator is ending
 
     async def _pass_gate(self) -> None:
         coroutine = self._gate()
@@ -556,7 +556,7 @@ class Resync:
             return
         self.failures.pop(where, None)
         self._answered.set()
-        # Those of which no event told that they are gone get a last reconcile that finds it out.
+        # Pools whose deletion was missed get a last reconcile, which finds that they are gone.
         known = [key for key in self._queue.known() if namespace in (None, key.namespace)]
         for key in dict.fromkeys([key for key in found if key is not None] + known):
             self._queue.add(key)

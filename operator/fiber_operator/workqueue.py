@@ -50,7 +50,7 @@ LONGEST_BLOCK = 1.0
 """Seconds for which a failure keeps even new events out."""
 
 LONG = 2.0
-"""Seconds after which a reconcile waits for somebody rather than works."""
+"""Seconds after which a reconcile counts as waiting and not as working."""
 YIELD = 10.0
 """Seconds by which a pool whose last reconcile failed lets others go first."""
 CROWD = 4
@@ -63,7 +63,7 @@ _Heaps = dict[str, _Heap]
 
 
 class Key(NamedTuple):
-    """A pool's place; who has the name may change."""
+    """Namespace and name of a pool.  A later pool may have the same name."""
 
     namespace: str
     name: str
@@ -74,7 +74,7 @@ class Result:
     """Result of one reconcile of a pool."""
 
     requeue_after: float | None = None
-    """Reconcile again after this many seconds though nothing happens."""
+    """Reconcile again after this many seconds even without an event."""
     rest: float = 0.0
     """Do not reconcile again for this many seconds in any case."""
     lull: bool = False
@@ -174,7 +174,7 @@ class WorkQueue:
             await asyncio.gather(*self._tasks, return_exceptions=True)
 
     async def drain(self, grace: float) -> None:
-        """Begin no reconcile any more and give those under way ``grace`` seconds to end."""
+        """Start no further reconcile, and give those under way ``grace`` seconds to end."""
         self._concurrency = 0
         if self._tasks:
             await asyncio.wait(self._tasks, timeout=grace)
@@ -200,7 +200,7 @@ class WorkQueue:
         )
 
     def known(self) -> list[Key]:
-        """Every pool that was added and not found to be gone."""
+        """Return every pool that was added and was not found to be gone."""
         return list(self._entries)
 
     def _now(self) -> float:
@@ -287,7 +287,7 @@ class WorkQueue:
         self._wake.set()
 
     async def _sleep(self) -> None:
-        """Until a place is due or comes free, or something happens."""
+        """Wait until a pool is due, a place becomes free, or a pool is added."""
         now = self._now()
         firsts = [due for due, _, _ in self._firsts()]
         begun = [started for started, _ in self._tasks.values()]

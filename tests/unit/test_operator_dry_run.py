@@ -56,7 +56,7 @@ def test_a_misspelt_field_is_a_problem_that_names_it(wrong: Body, path: str) -> 
         message = await message_of(world, "InvalidTemplate")
         (problem,) = world.status()["problems"]
         assert f'unknown field "{path}' in message
-        assert "correct its name or its place, or leave it out" in message
+        assert "correct the name or place of the field, or remove it" in message
         assert CANNOT not in message
         assert problem["terminal"]
         assert world.status()["phase"] == "Failed"

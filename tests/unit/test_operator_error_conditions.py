@@ -260,10 +260,10 @@ async def test_a_lease_that_may_not_be_read_is_a_warning(world: World) -> None:
     await world.settled(60)
     conditions = {c["type"]: c for c in world.status()["conditions"]}
     assert conditions["MasterAlive"]["status"] == "Unknown"
-    assert "may not read the Lease es" in conditions["MasterAlive"]["message"]
+    assert "lacks the right to read the Lease es" in conditions["MasterAlive"]["message"]
     assert conditions["Accepted"]["status"] == "True"
     assert world.status()["phase"] == "Ready"
-    assert "onLost (ScaleToMin) is never applied" in world.status()["problems"][0]["message"]
+    assert "onLost (ScaleToMin) is not applied" in world.status()["problems"][0]["message"]
 
 
 # -- Calls that fail

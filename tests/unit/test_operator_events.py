@@ -42,7 +42,7 @@ def test_what_is_done_is_told() -> None:
     assert [event.message for event in made.events[:3]] == [
         "Deleting workers that the master released",
         "Deleting workers of an older template",
-        "Creating workers: more are wanted than are there",
+        "Creating workers: more are wanted",
     ]
 
 
@@ -101,8 +101,8 @@ def test_disruptions_are_told_together() -> None:
     made, _ = look(pool, *pods, terminating(running(3)))
     (event,) = (event for event in made.events if event.reason == "Disrupted")
     assert event.message == (
-        f"{name_of(2)} and 1 more ended through no fault of its own: EvictionByEvictionAPI. "
-        "A new one takes its place at once"
+        f"The cluster ended {name_of(2)} and 1 more: EvictionByEvictionAPI. "
+        "A new worker replaces it at once"
     )
 
 

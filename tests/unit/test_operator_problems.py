@@ -386,7 +386,7 @@ def test_a_lease_that_is_gone_is_told_so() -> None:
     seen = then(pool, status_of(pool, running(1), master=plans.LeaseVerdict(alive=True)))
     found = problem(seen, running(1), master=plans.LeaseVerdict(alive=False, missing=True))
     assert found.reason == "MasterLost"
-    assert "The Lease es was not there for 30 s" in found.message
+    assert "The Lease es did not exist for 30 s" in found.message
 
 
 def test_a_lease_that_is_not_there_is_told_with_what_to_do() -> None:

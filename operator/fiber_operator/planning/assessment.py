@@ -24,34 +24,36 @@ from fiber_operator.planning.pods import PodState, PodView, Trouble
 
 @dataclass(frozen=True)
 class MasterState:
-    """The master, as far as the operator can tell."""
+    """State of the master, as far as the operator knows it."""
 
     attached: bool
-    """A master may have given work to the pods, so that only it knows which are idle."""
+    """True if a master may have given work to pods.  Only the master knows which are idle."""
     alive: bool | None
-    """None: there is none, or nobody can tell."""
+    """None: there is no master, or its state is not known."""
     lost_since: float | None = None
-    """Set while ``alive`` is False."""
+    """Time since which the master is lost; set while ``alive`` is False."""
     due: float | None = None
-    """Time at which the grace of a lost master ends, if it has not ended."""
+    """End of a lost master's grace period; None once it has ended."""
     missing: bool = False
-    """True if there is no Lease of that name, and it is too soon to call the master lost."""
+    """True if the Lease does not exist and it is too early to call the master lost."""
     connected: int | None = None
-    """Agents that are linked to it; None: nobody can tell."""
+    """Number of agents with a link to the master; None: not known."""
     gone: bool = False
-    """The grace is over and this process itself found the Lease expired: ``onLost`` applies."""
+    """True if the grace period is over and this process itself found the Lease expired.
+
+    ``onLost`` applies then."""
 
     @property
     def grace_is_over(self) -> bool:
-        """Tell whether the grace of a lost master is over."""
+        """True if the master is lost and its grace period is over."""
         return self.alive is False and self.due is None
 
 
 def judge_master(pool: FiberPool, lease: plans.LeaseVerdict, now: float) -> MasterState:
-    """Judge the master by the spec, the Lease and the status together.
+    """Judge the master by the spec, the Lease and the status.
 
-    After a restart the operator does not know for a while; it goes by the status meanwhile, if
-    that is of this master, and neither deletes for a lost master nor creates for one.
+    For a while after its restart the operator does not know about the Lease.  It then relies on the
+    status, if that describes this master, and neither deletes nor creates pods for a lost master.
     """
     master = pool.spec.master
     if master is None:
@@ -75,19 +77,19 @@ def judge_master(pool: FiberPool, lease: plans.LeaseVerdict, now: float) -> Mast
 
 
 def awaits_agents(pool: FiberPool) -> bool:
-    """Return whether the pool has a master that is not known to be lost."""
+    """Return True if the pool has a master that is not known to be lost."""
     before = _condition(pool)
     return pool.spec.master is not None and not (before and before.status == "False")
 
 
 @dataclass(frozen=True)
 class Idleness:
-    """A master that asks for no workers, where ``spec.idle`` says how long that may last."""
+    """Time for which a master has wanted no workers, where ``spec.idle`` limits it."""
 
     since: float | None = None
-    """None: it asks for some, there is none, or nobody minds."""
+    """None: the master wants workers, there is no master, or ``spec.idle`` is absent."""
     due: float | None = None
-    """Time at which the master counts as forgotten, if it does not yet."""
+    """Time at which the master will count as forgotten; None once it does."""
 
     @property
     def forgotten(self) -> bool:
@@ -96,9 +98,9 @@ class Idleness:
 
 
 def idleness(pool: FiberPool, master_state: MasterState, now: float) -> Idleness:
-    """Judge how long the master has asked for nothing, by the spec and the status.
+    """Judge by the spec and the status for how long the master has wanted no workers.
 
-    One that is lost is not idle: ``onLost`` says what follows.
+    A lost master is not idle: ``onLost`` applies to it.
     """
     idle, master = pool.spec.idle, pool.spec.master
     if idle is None or master is None or pool.spec.replicas or master_state.alive is False:
@@ -112,21 +114,21 @@ def idleness(pool: FiberPool, master_state: MasterState, now: float) -> Idleness
 def _lost_since(pool: FiberPool, before: PoolCondition | None, now: float) -> float:
     if before is not None and before.status == "False":
         known = past(before.last_transition_time, now)
-        # The pool may be deleted for it, so it must be a time at which there was one.
+        # The pool may be deleted because of this time: it must not be before the pool's creation.
         if known is not None and known >= (pool.metadata.creation_timestamp or 0.0):
             return known
     return float(math.floor(now))
 
 
 def _connected_before(pool: FiberPool) -> int | None:
-    """Return the connected agents of this master that the status has from an earlier operator."""
+    """Return this master's number of connected agents, from the status."""
     master, status = pool.spec.master, pool.status
     same = master is not None and status.master_epoch == master.epoch
     return status.connected_replicas if same else None
 
 
 def _condition(pool: FiberPool) -> PoolCondition | None:
-    """Return the condition about this master in the status, also if the spec has changed."""
+    """Return the condition MasterAlive from the status, if it is about this master."""
     if pool.spec.master is None or pool.status.master_epoch != pool.spec.master.epoch:
         return None
     conditions = pool.status.conditions
@@ -136,15 +138,19 @@ def _condition(pool: FiberPool) -> PoolCondition | None:
 # -- Pods that cannot reach their master
 
 OUTDATED = "cut-off"
-"""Mark in place of a template's hash."""
+"""Value in place of the template's hash of a pod that is cut off."""
 
 SKEW = 5.0
-"""Seconds that the clocks of two API servers may differ by, which date the Secret and the pods."""
+"""Seconds by which the clocks of two API servers may differ.  They date the Secret and the pods."""
 
 
 @dataclass(frozen=True)
 class CutOff:
-    """Live pods, by what is wrong with them."""
+    """Live pods that cannot reach their master.
+
+    A pod keeps the address and the key that it was created with.  They are useless after the pool's
+    Service or Secret was deleted and made anew with another address or key.
+    """
 
     by_address: Sequence[PodView]
     by_credentials: Sequence[PodView]
@@ -160,10 +166,10 @@ def find_cut_off(pool: FiberPool, live: Sequence[PodView], knowledge: Knowledge)
 
 
 def mark_cut_off(pods: Sequence[PodView], cut_off: CutOff, *, attached: bool) -> list[PodView]:
-    """``pods``, of which those that are cut off are like those of an older template.
+    """Return ``pods``, with those that are cut off marked as outdated.
 
-    A master that is attached may hold the old credentials as they do: they are of use to it, and
-    new ones are not.
+    An attached master may hold the old credentials, too.  Then only pods with the old credentials
+    are of use to it, and these are not marked.
     """
     useless = {pod.name for pod in cut_off.by_address}
     if not attached:
@@ -184,21 +190,21 @@ def _names_its_own_address(pool: FiberPool) -> bool:
 # -- The assessment
 
 QUOTA_WAIT = 30.0
-"""The longest wait until a full quota is tried again: it is freed without a sign."""
+"""Longest delay in seconds of the next try after a full quota.  No event says that it is free."""
 
 ACCOUNT_WAIT = 1.0
-"""The same for a ServiceAccount that is not there: in a new namespace it is in a moment."""
+"""The same delay for a missing ServiceAccount.  In a new namespace it appears in a moment."""
 
 _HINDERED = (Trouble.UNSCHEDULABLE, Trouble.CANNOT_START)
 
 
 class Assessment:
-    """All that a plan follows from.  Worked out from its arguments alone."""
+    """Facts that a plan follows from.  They depend on the arguments alone."""
 
     def __init__(
         self, pool: FiberPool, pods: Sequence[PodView], knowledge: Knowledge, now: float
     ) -> None:
-        """``pods`` are the pool's own, the oldest first."""
+        """Assess a pool with ``pods``, which are the pool's own, the oldest first."""
         self.pool, self.spec = pool, pool.spec
         self.knowledge, self.now = knowledge, now
         self.template_hash = manifests.template_hash(pool)
@@ -209,7 +215,7 @@ class Assessment:
         self.pods = [self._fairly_judged(pod) for pod in pods]
         self.master_state = judge_master(pool, knowledge.master, now)
         if self.spec.master is None or self.master_state.alive is False:
-            # Those whose master has gone before they reached it wait for the next on purpose.
+            # Agents without a living master wait for the next one, and are not late.
             self.pods = [replace(pod, joining=False) for pod in self.pods]
         self.idleness = idleness(pool, self.master_state, now)
         lost = find_cut_off(pool, [pod for pod in self.pods if pod.live], knowledge)
@@ -220,22 +226,25 @@ class Assessment:
         self.late = self._not_ready_in_time()
         self.desired = self._wanted()
         self.expected = self._asked_to_end()
-        """Names of pods whose end is nobody's failure."""
+        """Names of pods whose end was requested and is no failure."""
         self.refused_until = self._refused_until()
         self.account = self._count()
         self.may_create = self._can_make_pods()
 
     def _fairly_judged(self, pod: PodView) -> PodView:
-        """An agent whose master is lost ends with 0, however soon that is."""
+        """Return ``pod``; one that ended with 0 after the grace period did not fail.
+
+        An agent ends so when its master is lost, even soon after its start.
+        """
         master, brief = self.spec.master, pod.state is PodState.ENDED and pod.exit_code == 0
         if master is None or not brief or pod.trouble is not Trouble.APPLICATION:
             return pod
-        # The cluster's times are whole seconds.
+        # The cluster's times are in whole seconds.
         waited = pod.ran > 0 and pod.ran >= master.lost_grace_seconds - 1
         return replace(pod, trouble=Trouble.COMPLETED) if waited else pod
 
     def _not_ready_in_time(self) -> list[PodView]:
-        """Workers that run and do not get Ready: they failed, only that they do not end."""
+        """Return workers that run and did not become Ready in time: they count as failed."""
         if self.ends or self.spec.suspend:
             return []
         limit = self.now - self.spec.failure_policy.startup_timeout_seconds
@@ -262,7 +271,7 @@ class Assessment:
         )
 
     def _hindered(self) -> int:
-        """Workers that are wanted and not there for other reasons than that workers fail."""
+        """Return how many wanted workers are missing for other reasons than failures."""
         missing = max(0, self.desired - len(self.live)) if self.refused_until else 0
         return missing + sum(pod.trouble in _HINDERED for pod in self.live)
 
@@ -273,18 +282,18 @@ class Assessment:
         if self.spec.on_lost != "ScaleToMin" or not master_state.grace_is_over:
             return self.pool.wanted
         floor = self.spec.min_replicas
-        # Not yet confirmed by this process: keep what there is.
+        # This process has not confirmed the loss yet: keep the pods that exist.
         return floor if master_state.gone else min(self.pool.wanted, max(floor, len(self.live)))
 
     @property
     def floor(self) -> int:
-        """Number of pods that minReplicas keeps and the master does not want."""
+        """Number of workers that minReplicas keeps beyond the master's wish."""
         spec, forgotten = self.spec, self.idleness.forgotten
         return spec.min_replicas if spec.replicas < spec.min_replicas and not forgotten else 0
 
     @property
     def accepted(self) -> bool:
-        """The API server takes pods of this template, or did."""
+        """True if the API server accepts, or has accepted, pods of this template."""
         return self.template_hash in (self.knowledge.accepted, self.account.proven)
 
     def _refused_until(self) -> float | None:
@@ -310,7 +319,7 @@ class Assessment:
         )
 
     def _is_orphaned(self) -> bool:
-        """Tell whether the master is lost, and the pool does not show that yet."""
+        """Return True if the master is lost and the pool was not scaled down for it yet."""
         master_state = self.master_state
         if self.spec.on_lost == "Retain":
             return False

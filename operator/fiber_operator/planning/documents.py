@@ -9,14 +9,14 @@ from fiber_api.times import parse_time
 
 
 def mapping(value: object, *path: str) -> Mapping[str, Any]:
-    """The object at ``path`` below ``value``; an empty one where there is none."""
+    """Return the object at ``path`` below ``value``; an empty one if there is none."""
     for name in path:
         value = value.get(name) if isinstance(value, Mapping) else None
     return value if isinstance(value, Mapping) else {}
 
 
 def items(value: object) -> Iterator[Mapping[str, Any]]:
-    """The objects in a list; what else stands in it is left out."""
+    """Yield the objects in a list and skip its other items."""
     if isinstance(value, list | tuple):
         for item in value:
             if isinstance(item, Mapping):
@@ -24,26 +24,26 @@ def items(value: object) -> Iterator[Mapping[str, Any]]:
 
 
 def text(value: object) -> str:
-    """A string; an empty one for anything else."""
+    """Return ``value`` if it is a string, else an empty string."""
     return value if isinstance(value, str) else ""
 
 
 def whole(value: object, default: int = 0) -> int:
-    """An integer; ``default`` for anything else."""
+    """Return ``value`` if it is an integer, else ``default``."""
     return value if isinstance(value, int) and not isinstance(value, bool) else default
 
 
 SKEW = 60.0
-"""Seconds that the clocks of a cluster may differ by."""
+"""Seconds by which the clocks of a cluster may differ."""
 
 
 def past(time: float | None, now: float) -> float | None:
-    """A time that the operator wrote; None if it has not come yet: then it is none of ours."""
+    """Return ``time``, or None if it is in the future: the operator did not write it then."""
     return None if time is None or time > now + SKEW else time
 
 
 def seconds(value: object) -> float:
-    """The unix time that a timestamp of the API tells; 0.0 where it tells none."""
+    """Return the unix time of a timestamp of the API; 0.0 if it is none."""
     try:
         return parse_time(value) if isinstance(value, str) else 0.0
     except ValueError:

@@ -28,21 +28,21 @@ from fiber_api.v1alpha1 import FailurePolicy, Failures
 from fiber_operator.planning.pods import BRIEF, PodState, PodView, Trouble
 
 RECOVERY = 60.0
-"""Seconds for which a worker must be Ready to show that workers can live."""
+"""Seconds for which a worker must be Ready to prove that workers can live."""
 
 NAMES = 1000
-"""Pods that a status names, at most; a status that etcd refuses would stop the pool.  What has no
-place in it is counted when pods that have one are gone."""
+"""Most pods that a status names, because a status that is too large for etcd would stop the pool.
+Further failures are counted after named pods are gone."""
 
 AT_ONCE = "CompletedAtOnce"
-"""Why a worker failed that ended with exit code 0 and had not worked."""
+"""Reason of a worker that ended with exit code 0 before it had worked."""
 
 _JITTER = 0.1
-"""Share by which a wait may be longer, so that pools that fail together are spread out."""
+"""Largest share that is added to a delay, so that pools that failed together are spread out."""
 
 
 def delay(policy: FailurePolicy, waves: int, seed: str) -> float:
-    """Seconds to wait after so many waves in a row; the same for the same arguments."""
+    """Return the delay in seconds after so many waves; the same for the same arguments."""
     doubled = policy.backoff_base_seconds * (1 << min(max(waves, 1) - 1, 30))
     digest = hashlib.sha256(f"{seed}/{waves}".encode()).digest()
     jitter = _JITTER * int.from_bytes(digest[:4]) / 2**32
@@ -50,30 +50,30 @@ def delay(policy: FailurePolicy, waves: int, seed: str) -> float:
 
 
 def given_up(failures: Failures, policy: FailurePolicy) -> bool:
-    """Tell whether no pod is created until the user changes something."""
+    """Return True if no pod is created until the user changes the spec."""
     return failures.consecutive > policy.backoff_limit
 
 
 def held_back_until(failures: Failures, now: float) -> float | None:
-    """Return when waiting replacements are created; None if none waits."""
+    """Return the time at which waiting replacements are created; None if none waits."""
     due = failures.next_create_time
     return due if failures.waiting and due is not None and due > now else None
 
 
 @dataclass(frozen=True)
 class Account:
-    """Account of failures after one look at the pods."""
+    """Account of failures after one observation of the pods."""
 
     failures: Failures
     proven: str | None
-    """The template hash of which a pod was Ready."""
+    """Hash of the last template of which a pod was Ready."""
     failed: tuple[PodView, ...] = ()
-    """Newly counted, the newest last."""
+    """Failed pods that were counted now, the newest last."""
     disrupted: tuple[PodView, ...] = ()
     held_back: int = 0
-    """Places of workers that failed, which are not to be taken yet."""
+    """Number of failed workers that are not to be replaced yet."""
     recovers: float | None = None
-    """Time at which the waves are over, if nothing happens until then."""
+    """Time at which the waves end if no worker fails until then."""
 
 
 def account(
@@ -92,15 +92,15 @@ def account(
 ) -> Account:
     """Bring the account up to date.
 
-    ``expected`` names pods whose end was asked for; ``late`` names pods that are not Ready in
-    time, which counts as a failure; ``desired`` is how many are wanted and could be there.
+    ``expected`` names pods whose end was requested.  ``late`` names pods that are not Ready in
+    time, which counts as a failure.  ``desired`` is how many wanted workers could exist.
     """
     found = _begin(before, pods, late, spec_hash, policy, now)
     ended = [p for p in pods if p.name not in found.counted and p.name not in expected]
     ended.sort(key=lambda pod: (pod.since, pod.name))
     failing = [p for p in ended if p.name in late or _failed(p)]
     failed = failing[: NAMES - len(found.counted)]
-    # Those of a silent node stay for long; they must leave room for failures.
+    # Pods of a silent node exist for long; they must leave room for failures.
     room = max(0, NAMES // 2 - len(found.counted) - len(failed))
     disrupted = [p for p in ended if p.name not in late and _disrupted(p)][:room]
     found = _with(
@@ -130,7 +130,7 @@ def account(
 
 
 def _with(failures: Failures, **fields: Any) -> Failures:
-    """Return failures with other fields.  Sums stay within what a status may hold."""
+    """Return failures with other fields.  Sums stay within the limits of a status."""
     held = {key: min(x, MAX_COUNT) if isinstance(x, int) else x for key, x in fields.items()}
     return failures.model_copy(update=held)
 
@@ -143,8 +143,8 @@ def _begin(
     policy: FailurePolicy,
     now: float,
 ) -> Failures:
-    """Less what is over: pods that are gone, a wait, and waves of another spec."""
-    # One that was late and became Ready, for its deletion came too late, is like any other.
+    """Return the failures without deleted pods, delays that are over, and waves of another spec."""
+    # A late pod that became Ready before its deletion is like any other.
     there = {pod.name for pod in pods if not pod.live or pod.name in late}
     found = _with(before, counted=tuple(name for name in before.counted if name in there))
     if found.spec_hash != spec_hash:
@@ -157,7 +157,7 @@ def _begin(
 
 
 def _longest(policy: FailurePolicy) -> float:
-    """A time further away was written by nobody who knows this policy."""
+    """Return the longest delay.  A later time was not written under this policy."""
     return policy.backoff_max_seconds * (1 + _JITTER) + 1
 
 
@@ -166,7 +166,7 @@ def _failed(pod: PodView) -> bool:
 
 
 def in_itself(pod: PodView) -> bool:
-    """Tell of a failed pod whether it failed in itself: False if it exited with 0 after a while."""
+    """Return False if a failed pod exited with 0 after it had worked."""
     return pod.trouble is not Trouble.COMPLETED
 
 
@@ -175,7 +175,7 @@ def _disrupted(pod: PodView) -> bool:
 
 
 def _has_lived(pod: PodView, now: float) -> bool:
-    """Tell whether a pod was Ready for long enough, as far as is known."""
+    """Return True if a pod is known to have been Ready for long enough."""
     if pod.state is PodState.READY:
         return now - pod.since >= RECOVERY
     return pod.state is PodState.ENDED and pod.was_ready and pod.ran >= RECOVERY
@@ -192,14 +192,14 @@ def _fail(
     last = (list(filter(in_itself, failed)) or failed)[-1]
     found = _with(found, last_exit_code=last.exit_code, last_reason=_reason(last))
     if found.next_create_time is not None and found.next_create_time > now:
-        return found  # more of the same wave
+        return found  # the same wave
     lived = all(_has_lived(pod, now) for pod in failed)
     in_vain = not works and any(map(in_itself, failed))
     waves = 1 if lived else found.waves + 1
     found = _with(found, waves=waves, consecutive=found.consecutive + in_vain)
     if given_up(found, policy):
         return _with(found, waiting=0, next_create_time=None)
-    # In whole seconds, as it stands in the status.
+    # In whole seconds, as in the status.
     return _with(found, next_create_time=float(math.ceil(now + delay(policy, waves, seed))))
 
 
@@ -214,10 +214,10 @@ def _reason(pod: PodView) -> str:
 def _recovers(
     found: Failures, pods: Sequence[PodView], desired: int, policy: FailurePolicy, seed: str
 ) -> float | None:
-    """Return when workers will have lived long enough, if nothing happens until then.
+    """Return the time at which workers will have lived long enough, if none fails until then.
 
-    That is when one that became Ready since the last wave began has stayed so for a minute, or all
-    that are wanted have: where fewer are wanted than there were, no new one need ever come.
+    A worker that became Ready after the start of the last wave must stay Ready for a minute.  It is
+    also enough if all wanted workers do so: if fewer are wanted now, no new worker may come.
     """
     if not found.waves or given_up(found, policy):
         return None
@@ -239,8 +239,8 @@ def _proven(
     now: float,
 ) -> str | None:
     ready = [p for p in pods if p.template_hash == template_hash and p.state is PodState.READY]
-    # Without a readiness probe a worker is Ready for a moment before it fails.  Once that has
-    # happened, Ready has to last.
+    # Without a readiness probe a worker is Ready for a moment before it fails.  After a failure,
+    # Ready must last.
     if any(not found.waves or now - pod.since >= BRIEF for pod in ready):
         return template_hash
     own = (pod for pod in failed if in_itself(pod) and pod.template_hash == template_hash)

@@ -20,14 +20,15 @@ from fiber_operator.planning.documents import items, mapping, text
 
 
 def selector(pool: FiberPool) -> str:
-    """The label selector of the pool's pods; an earlier pool of the same name has another."""
+    """Return the label selector of the pool's pods.  An earlier pool of that name had another."""
     return f"{names.LABEL_POOL_UID}={pool.metadata.uid}"
 
 
 def service(pool: FiberPool) -> dict[str, Any]:
-    """The Service without a selector that agents dial, of both IP families if the cluster has both.
+    """Return the Service that agents dial.  It has no selector.
 
-    The master may be of either, and agents dial both.
+    It has both IP families if the cluster has both: the master may have either, and agents dial
+    both.
     """
     port = {
         "name": names.MASTER_PORT_NAME,
@@ -44,7 +45,7 @@ def service(pool: FiberPool) -> dict[str, Any]:
 
 
 def endpoint_slice(pool: FiberPool) -> dict[str, Any]:
-    """The one EndpointSlice of the Service: the master's address, or no endpoint."""
+    """Return the Service's only EndpointSlice, with the master's address if there is a master."""
     metadata = _metadata(pool, names.endpoint_slice_name(pool.metadata.name))
     metadata["labels"] |= {
         names.LABEL_SERVICE_NAME: names.service_name(pool.metadata.name),
@@ -61,7 +62,7 @@ def endpoint_slice(pool: FiberPool) -> dict[str, Any]:
 
 
 def budget(pool: FiberPool) -> dict[str, Any]:
-    """The PodDisruptionBudget of the pool's workers."""
+    """Return the PodDisruptionBudget of the pool's workers."""
     return {
         "apiVersion": "policy/v1",
         "kind": "PodDisruptionBudget",
@@ -69,14 +70,14 @@ def budget(pool: FiberPool) -> dict[str, Any]:
         "spec": {
             "minAvailable": pool.spec.min_available,
             "selector": {"matchLabels": {names.LABEL_POOL_UID: pool.metadata.uid}},
-            # A worker that does not get ready holds up no drain.
+            # A worker that does not become ready must not hold up a drain.
             "unhealthyPodEvictionPolicy": "AlwaysAllow",
         },
     }
 
 
 def secret(pool: FiberPool, data: Mapping[str, str]) -> dict[str, Any]:
-    """The credentials Secret; ``data`` maps the keys of ``fiber_api.names`` to plain text."""
+    """Return the Secret with the pool's key.  ``data`` maps the names of its keys to plain text."""
     return {
         "apiVersion": "v1",
         "kind": "Secret",
@@ -87,13 +88,13 @@ def secret(pool: FiberPool, data: Mapping[str, str]) -> dict[str, Any]:
 
 
 def is_ours(pool: FiberPool, existing: Mapping[str, Any]) -> bool:
-    """Tell whether an object that already has the name was made for this pool."""
+    """Return True if an existing object was made for this pool."""
     owners = items(mapping(existing, "metadata").get("ownerReferences"))
     return any(o.get("uid") == pool.metadata.uid and o.get("controller") is True for o in owners)
 
 
 def other_owner(pool: FiberPool, secret: Mapping[str, Any]) -> str | None:
-    """The name of another FiberPool whose Secret this is."""
+    """Return the name of the other FiberPool that this Secret belongs to; None if there is none."""
     metadata = mapping(secret, "metadata")
     owners = [o for o in items(metadata.get("ownerReferences")) if o.get("kind") == names.KIND]
     for owner in owners:
@@ -104,9 +105,9 @@ def other_owner(pool: FiberPool, secret: Mapping[str, Any]) -> str | None:
 
 
 def slice_patch(pool: FiberPool, existing: Mapping[str, Any]) -> dict[str, Any] | None:
-    """The merge patch that points an existing EndpointSlice to the master; None if it does.
+    """Return the merge patch that points an EndpointSlice to the master; None if it already does.
 
-    It cannot change ``addressType``, which is immutable: see ``slice_must_be_replaced``.
+    ``addressType`` is immutable: see ``slice_must_be_replaced``.
     """
     wanted = endpoint_slice(pool)
     labels = wanted["metadata"]["labels"]
@@ -121,21 +122,21 @@ def slice_patch(pool: FiberPool, existing: Mapping[str, Any]) -> dict[str, Any] 
 
 
 def slice_must_be_replaced(pool: FiberPool, existing: Mapping[str, Any]) -> bool:
-    """Tell whether the master moved between IPv4 and IPv6: make the slice anew then."""
+    """Return True if the master moved between IPv4 and IPv6, so that a new slice is needed."""
     master = pool.spec.master
     return master is not None and existing.get("addressType") != _family(master)
 
 
 def owner_reference(pool: FiberPool) -> dict[str, Any]:
-    """Ties an object's life to the pool's."""
+    """Return the owner reference by which Kubernetes deletes an object together with the pool."""
     return {
         "apiVersion": names.API_VERSION,
         "kind": names.KIND,
         "name": pool.metadata.name,
         "uid": pool.metadata.uid,
         "controller": True,
-        # True needs the right to change the pool's finalizers, on clusters that check it, and
-        # would let a pod that cannot end hold up the end of the pool.
+        # True would need the right to change the pool's finalizers on clusters that check it, and
+        # a pod that cannot end would hold up the pool's deletion.
         "blockOwnerDeletion": False,
     }
 
@@ -162,8 +163,8 @@ def _family(master: MasterSpec | None) -> str:
 def _endpoints(master: MasterSpec | None) -> list[dict[str, Any]]:
     if master is None:
         return []
-    # Ready even where the master's Lease has expired: whoever dials finds out sooner than a Lease
-    # does, and a master that was only slow is found at once.
+    # Ready even if the master's Lease has expired: a connection fails sooner than a Lease expires,
+    # and a master that was only slow is found at once.
     conditions = {"ready": True, "serving": True, "terminating": False}
     return [{"addresses": [master.host], "conditions": conditions}]
 
@@ -175,7 +176,7 @@ def _ports(master: MasterSpec | None) -> list[dict[str, Any]]:
 
 
 def _leads_to(document: Mapping[str, Any]) -> tuple[list[Any], list[Any]]:
-    """Return addresses and ports of a slice, without what the API server may have added."""
+    """Return addresses and ports of a slice, without fields that the API server may have added."""
     addresses = [
         (endpoint.get("addresses"), mapping(endpoint, "conditions").get("ready"))
         for endpoint in items(document.get("endpoints"))
@@ -187,22 +188,22 @@ def _leads_to(document: Mapping[str, Any]) -> tuple[list[Any], list[Any]]:
 # -- Hashes
 
 _LENGTH = 16
-"""Hexadecimal digits; few enough for a label and enough for the revisions of one pool."""
+"""Hexadecimal digits of a hash: few enough for a label, enough for the revisions of one pool."""
 
 
 def template_hash(pool: FiberPool) -> str:
-    """Return a hash of the worker: of the template, and of the number of processes in each.
+    """Return a hash of the template and of the number of processes in each pod.
 
-    Nothing that the operator adds is in it, so that a new operator replaces no pod, and nothing
-    that the SDK writes.
+    It does not depend on fields that the operator adds, so that a new operator replaces no pod, or
+    on fields that the SDK writes.
     """
     return _digest({"template": pool.spec.template, "processes": pool.spec.processes_per_pod})
 
 
 def spec_hash(pool: FiberPool) -> str:
-    """Return a hash of all that a user or a new master changes to revive a failed pool.
+    """Return a hash of the fields that a user or a new master changes to revive a failed pool.
 
-    ``replicas`` and ``release`` are not in it: the SDK writes them all the time.
+    It does not depend on ``replicas`` and ``release``, which the SDK writes all the time.
     """
     spec = pool.spec
     return _digest(

@@ -20,7 +20,7 @@ _SIGNALS |= {1: "SIGHUP", 2: "SIGINT", 15: "SIGTERM"}
 
 
 def quoted(words: str) -> str:
-    """The cluster's words as the end of a clause."""
+    """Return the cluster's words as the end of a clause: a colon and the words, or nothing."""
     words = words.strip().rstrip(".: ")  # a probe that says nothing leaves a colon
     return f": {words}" if words else ""
 
@@ -29,26 +29,26 @@ def quoted(words: str) -> str:
 
 _NOT_STARTING: Mapping[Reason, tuple[str, str]] = {
     Reason.INVALID_IMAGE_NAME: (
-        "has an image name that is none",
+        "has an invalid image name",
         "Correct the image in spec.template.",
     ),
     Reason.IMAGE_NEVER_PULL: (
-        "has an image that is not on its node, and imagePullPolicy Never forbids to fetch it",
+        "has an image that is not on its node, and imagePullPolicy Never forbids fetching it",
         "Load the image onto every node, or change imagePullPolicy in spec.template.",
     ),
     Reason.IMAGE_PULL_ERROR: (
         "cannot get its image",
-        "If the image, its tag or the imagePullSecrets in spec.template are wrong, correct them; "
-        "if the registry is to blame, wait: the kubelet tries again by itself.",
+        "Correct the image, its tag or the imagePullSecrets in spec.template if they are wrong. "
+        "If the registry is to blame, wait: the kubelet tries again by itself.",
     ),
     Reason.CONTAINER_CONFIG_ERROR: (
         "has a container that cannot be configured",
-        "Create the Secret, ConfigMap or key that is missing, upon which the kubelet goes on by "
-        "itself, or correct spec.template.",
+        "Create the missing Secret, ConfigMap or key, or correct spec.template. The kubelet tries "
+        "again by itself.",
     ),
     Reason.CONTAINER_ERROR: (
         "has a container that cannot be created",
-        "Correct spec.template if it is to blame; the kubelet tries again by itself.",
+        "Correct spec.template if it is to blame. The kubelet tries again by itself.",
     ),
     Reason.RUN_CONTAINER_ERROR: (
         "has a container that cannot be run",
@@ -62,74 +62,74 @@ _NOT_STARTING: Mapping[Reason, tuple[str, str]] = {
 
 _ROOT = (
     "Workers do not run as root unless the template says so. Give the image a numeric USER, or "
-    "set securityContext.runAsUser in spec.template, or runAsNonRoot: false there if it must be "
-    "root."
+    "set securityContext.runAsUser in spec.template. If the worker must be root, set runAsNonRoot: "
+    "false there."
 )
 
 
 def not_starting(reason: Reason, pod: PodView) -> str:
-    """A pod that the kubelet cannot start."""
+    """Return the message of a pod that the kubelet cannot start."""
     what, remedy = _NOT_STARTING[reason]
     if wants_root(pod):
         remedy = _ROOT
-    return f"{pod.name} {what}{quoted(_said(pod))}. {remedy}"
+    return f"{pod.name} {what}{quoted(_cluster_words(pod))}. {remedy}"
 
 
-def _said(pod: PodView) -> str:
+def _cluster_words(pod: PodView) -> str:
     return ": ".join(filter(None, (pod.reason, pod.message)))
 
 
 def wants_root(pod: PodView) -> bool:
-    """Tell whether the pod cannot start because it would be root."""
+    """Return True if the pod cannot start because it would run as root."""
     return "runAsNonRoot" in pod.message or "non-root" in pod.message
 
 
 def unschedulable(pod: PodView) -> str:
-    """A pod that no node takes."""
+    """Return the message of a pod that no node takes."""
     if pod.reason == "SchedulingGated":
         return (
-            f"{pod.name} is held back by a scheduling gate{quoted(pod.message)}. What has set "
-            "schedulingGates, a queue for instance, must lift them."
+            f"{pod.name} is held back by a scheduling gate{quoted(pod.message)}. The component "
+            "that has set schedulingGates, for example a queue, must remove them."
         )
     return (
-        f"No node takes {pod.name}{quoted(pod.message)}. Add nodes, or wait for a cluster "
-        "autoscaler to do so, or ask for less in spec.template: resources, nodeSelector, affinity."
+        f"No node takes {pod.name}{quoted(pod.message)}. Add nodes, wait for a cluster autoscaler "
+        "to add some, or request less in spec.template: resources, nodeSelector, affinity."
     )
 
 
 def stuck(pod: PodView, warning: str) -> str:
-    """A pod whose status does not say why it does not start, and what its events say."""
+    """Return the message of a pod that does not start, with the cause from its events."""
     return (
-        f"{pod.name} has a node but does not start{quoted(warning)}. Correct what is named "
-        "there; the kubelet goes on by itself."
+        f"{pod.name} has a node but does not start{quoted(warning)}. Correct this cause; the "
+        "kubelet tries again by itself."
     )
 
 
 def late(pod: PodView, seconds: int) -> str:
-    """A pod whose container takes too long to start; it is kept."""
+    """Return the message of a pod whose container takes too long to start; the pod is kept."""
     return (
         f"{pod.name} did not become ready in {seconds} s (failurePolicy.startupTimeoutSeconds). "
-        f"See what it waits for with kubectl describe pod {pod.name}, or allow it more time."
+        f"See what it waits for with kubectl describe pod {pod.name}, or raise the timeout."
     )
 
 
 def never_ready(pool: FiberPool, pod: PodView, warning: str) -> str:
-    """A pod whose container ran for too long without getting ready; it is deleted."""
+    """Return the message of a pod that is deleted because it ran too long without being ready."""
     seconds = pool.spec.failure_policy.startup_timeout_seconds
     return (
         f"{pod.name} ran for {seconds} s (failurePolicy.startupTimeoutSeconds) and did not become "
-        f"ready{quoted(warning or pod.message)}. It was deleted, since it holds what a node has. "
-        "Correct the readiness probe in spec.template or what that waits for, or allow more time. "
-        "To see the next one start: kubectl logs --follow --selector "
+        f"ready{quoted(warning or pod.message)}. It was deleted to free the resources of its "
+        "node. Correct the readiness probe in spec.template or what it waits for, or raise the "
+        "timeout. To see the next one start: kubectl logs --follow --selector "
         f"{names.LABEL_POOL}={pool.metadata.name}"
     )
 
 
 def not_ready(pod: PodView) -> str:
-    """A pod that was ready."""
+    """Return the message of a pod that is no longer ready."""
     return (
-        f"{pod.name} was ready and is not any more{quoted(pod.message or pod.reason)}. If its "
-        "node is silent it is replaced when Kubernetes gives the node up; else see "
+        f"{pod.name} was ready and is not ready now{quoted(pod.message or pod.reason)}. If its "
+        "node is silent, the pod is replaced when Kubernetes gives the node up. Else see "
         f"kubectl describe pod {pod.name}."
     )
 
@@ -137,11 +137,11 @@ def not_ready(pod: PodView) -> str:
 # -- Pods that fail
 
 LAST_LINES = " Its last lines:\n"
-"""Ends what is said of a failure; a worker's own output follows."""
+"""End of the message of a failure; the worker's output follows."""
 
 
 def failure(pool: FiberPool, failures: Failures, reason: Reason, pod: PodView) -> str:
-    """Return how a worker failed, when the next one comes, and its last lines."""
+    """Return how a worker failed, when it is replaced, and its last lines."""
     wait = _wait(failures)
     own = pod.message and not _ended_by_node(pod) and reason != Reason.RUN_CONTAINER_ERROR
     lines = f"{LAST_LINES}{pod.message}" if own else ""
@@ -149,7 +149,7 @@ def failure(pool: FiberPool, failures: Failures, reason: Reason, pod: PodView) -
 
 
 def late_failure(pool: FiberPool, failures: Failures, pod: PodView, warning: str) -> str:
-    """A worker that runs and counts as failed, and when the next one comes."""
+    """Return the message of a late worker that counts as failed, and when it is replaced."""
     return f"{never_ready(pool, pod, warning)}.{_wait(failures)}"
 
 
@@ -159,7 +159,7 @@ def _wait(failures: Failures) -> str:
 
 
 def forgotten_failure(pool: FiberPool, failures: Failures) -> str:
-    """A failure of which nothing is left but what the status says, if that."""
+    """Return the message of a failure whose pod is gone, from the status alone."""
     code = None if failures.last_exit_code is None else f"exit code {failures.last_exit_code}"
     known = ", ".join(filter(None, (failures.last_reason, code)))
     return (
@@ -169,16 +169,16 @@ def forgotten_failure(pool: FiberPool, failures: Failures) -> str:
 
 
 def completed(pool: FiberPool, failures: Failures, pod: PodView) -> str:
-    """Workers that end of themselves, wave after wave."""
+    """Return the message of workers that end by themselves, wave after wave."""
     if pod.reason == "DeadlineExceeded":
         what = f"{pod.name} was ended by activeDeadlineSeconds of spec.template{_after(pod)}"
     else:
         what = f"{pod.name} ended with exit code 0{_after(pod)} and was not released"
     return (
-        f"{what}, and so did those before it: {failures.waves} waves in a row. A worker is to "
-        f"run until it is released, so the container {pool.spec.worker_container!r} must run "
-        "python -m fiber.agent and nothing that ends. The agent itself ends so when it has had no "
-        "master for master.lostGraceSeconds: see whether the master can be reached."
+        f"{what}, and so did those before it: {failures.waves} waves in a row. A worker must run "
+        f"until it is released, so the container {pool.spec.worker_container!r} must run "
+        "python -m fiber.agent. The agent itself ends with 0 after master.lostGraceSeconds without "
+        "a master: check that the master can be reached."
         f"{_wait(failures)}"
     )
 
@@ -190,40 +190,40 @@ def _ending(pool: FiberPool, reason: Reason, pod: PodView) -> str:
         limit = _memory_limit(pool)
         return (
             f"{pod.name} ran out of memory{f' (its limit is {limit})' if limit else ''} and was "
-            "killed. Raise resources.limits.memory in spec.template, or let a worker hold less."
+            "killed. Raise resources.limits.memory in spec.template, or let tasks use less."
         )
     if reason == Reason.COMPLETED:
         return (
-            f"{pod.name} ended at once with exit code 0, without having worked. The container "
+            f"{pod.name} ended at once with exit code 0. The container "
             f"{pool.spec.worker_container!r} must run python -m fiber.agent: correct its command "
             "in spec.template."
         )
     if reason == Reason.RUN_CONTAINER_ERROR:
         return (
-            f"{pod.name} could not be run{quoted(_said(pod))}. Correct the command in "
+            f"{pod.name} could not be run{quoted(_cluster_words(pod))}. Correct the command in "
             "spec.template, or the image."
         )
     if _ended_by_node(pod):
         return (
-            f"{pod.name} failed{quoted(_said(pod))}. See kubectl describe pod {pod.name}; correct "
-            "spec.template if it asks for what a node cannot give."
+            f"{pod.name} failed{quoted(_cluster_words(pod))}. See kubectl describe pod {pod.name}; "
+            "correct spec.template if it requests more than a node has."
         )
     return f"{pod.name} {_exit(pod)}. See kubectl logs {pod.name} while the pod is kept."
 
 
 def _without_identity(reason: Reason, pod: PodView) -> str:
     could_not = reason == Reason.RUN_CONTAINER_ERROR
-    what = f"could not be run{quoted(_said(pod))}" if could_not else _exit(pod)
+    what = f"could not be run{quoted(_cluster_words(pod))}" if could_not else _exit(pod)
     return (
         f"The init container {names.IDENTITY_CONTAINER} of {pod.name} {what}. It has the pool's "
-        "key, and runs the worker's command on the image alone: without environment, working "
-        "directory and volumes of spec.template, but for a volume whose path the command names. "
-        "Install Fiber in the image, or name its interpreter by its path in the command."
+        "key and therefore runs the worker's command without the environment, the "
+        "working directory and the volumes of spec.template, except a volume whose path is in the "
+        "command. Install Fiber in the image, or write its interpreter's path into the command."
     )
 
 
 def _ended_by_node(pod: PodView) -> bool:
-    """Tell whether the message is the node's, not the worker's."""
+    """Return True if the message comes from the node and not from the worker."""
     return pod.exit_code is None or pod.reason == "Evicted"
 
 
@@ -250,15 +250,15 @@ def _memory_limit(pool: FiberPool) -> str:
 
 
 def limit_exceeded(pool: FiberPool, failures: Failures, last: str) -> str:
-    """Return the message of a pool that creates no more pods."""
+    """Return the message of a pool that was given up."""
     limit = pool.spec.failure_policy.backoff_limit
     return (
-        f"{failures.consecutive} waves of failures in a row, while fewer than half of the workers "
-        f"wanted were ready for a minute, are more than failurePolicy.backoffLimit allows ({limit})"
-        ": no more workers are created until the spec changes, in template, processesPerPod, "
-        "failurePolicy, update or suspend, or by a master with a new epoch. "
-        "Correct the cause and spec.template, or set spec.suspend and unset it to try again as it "
-        f"is. The last one: {last}"
+        f"Workers failed in {failures.consecutive} waves in a row, more than "
+        f"failurePolicy.backoffLimit ({limit}) allows; fewer than half of the wanted workers had "
+        "been ready for a minute. No workers are created until template, processesPerPod, "
+        "failurePolicy, update or suspend change in the spec, or a master with a new epoch comes. "
+        "Correct the cause and spec.template. To try again without a change, set spec.suspend and "
+        f"unset it. The last failure: {last}"
     )
 
 
@@ -266,9 +266,9 @@ def limit_exceeded(pool: FiberPool, failures: Failures, last: str) -> str:
 
 
 def refusal(reason: Reason, refused: PodRefusal) -> str:
-    """A pod that the API server does not take."""
+    """Return the message of a pod that the API server refuses."""
     what, remedy = _REFUSALS[reason]
-    # The pod that it names never was, and is called differently at each attempt.
+    # The refused pod does not exist, and its name differs in each attempt.
     words = _OF_THE_POD.sub("", refused.message)
     if reason == Reason.INVALID_TEMPLATE and _UNKNOWN in words:
         words, remedy = words.replace(_UNKNOWN, f"{_UNKNOWN}spec.template."), _MISSPELT
@@ -286,44 +286,44 @@ _OF_THE_POD = re.compile(
 _UNKNOWN = 'unknown field "'
 
 _MISSPELT = (
-    "A field that the API server does not know has no effect: correct its name or its place, or "
-    "leave it out; the running workers stay as they are."
+    "The API server ignores a field that it does not know: correct the name or place of the "
+    "field, or remove it. The running workers stay as they are."
 )
 
 _LIMIT_RANGE = re.compile(
     r"must be less than or equal to \S+ limit|usage per \w+ is |limit to request ratio per "
 )
-"""Words of the API server if requests and limits do not fit each other, or a LimitRange."""
+"""Words of the API server if requests and limits contradict each other or a LimitRange."""
 
 _OUT_OF_RANGE = (
     "A limit that spec.template does not set comes from a LimitRange of the namespace: kubectl get "
     "limitranges -o yaml shows its bounds and defaults. Change the LimitRange, or the requests and "
     "limits of the container in spec.template. A program does so with @fiber.meta(cpu=, memory=), "
     "which sets both, or with fiber.init(cpu_request=0, memory_request=0), which requests nothing, "
-    "so that the defaults of the LimitRange hold. The running workers stay as they are."
+    "so that the defaults of the LimitRange apply. The running workers stay as they are."
 )
 
 _REFUSALS: Mapping[Reason, tuple[str, str]] = {
     Reason.INVALID_TEMPLATE: (
         "The API server refuses pods of this template",
-        "Correct spec.template; the running workers stay as they are.",
+        "Correct spec.template. The running workers stay as they are.",
     ),
     Reason.QUOTA_EXCEEDED: (
         "A quota of the namespace allows no more workers",
-        "Lower replicas or what a worker asks for, or raise the ResourceQuota; the operator tries "
-        "again by itself.",
+        "Lower replicas or the requests of a worker, or raise the ResourceQuota. The operator "
+        "tries again by itself.",
     ),
     Reason.REQUESTS_MISSING: (
-        "A quota of the namespace counts what pods of this template do not ask for",
-        "Write what it names into resources.requests or resources.limits of the container in "
+        "A quota of the namespace counts resources that pods of this template do not request",
+        "Add these resources to resources.requests or resources.limits of the container in "
         "spec.template. A program does so with @fiber.meta(cpu=, memory=), which sets both, or "
         "with fiber.init(cpu_request=, memory_request=). A LimitRange of the namespace can give "
         "defaults. The running workers stay as they are.",
     ),
     Reason.FORBIDDEN: (
         "The API server forbids pods of this template",
-        "Correct what it names: the spec.template, the policy of the namespace, or the rights of "
-        "the operator. The running workers stay as they are.",
+        "Correct the cause that it names: spec.template, a policy of the namespace, or the rights "
+        "of the operator. The running workers stay as they are.",
     ),
 }
 
@@ -332,27 +332,27 @@ _REFUSALS: Mapping[Reason, tuple[str, str]] = {
 
 
 def master_lost(pool: FiberPool, since: float, lease: LeaseVerdict) -> str:
-    """A Lease that is not renewed."""
+    """Return the message of a master whose Lease is not renewed."""
     master = pool.spec.master
     assert master is not None
-    what = "was not there" if lease.missing else "was not renewed"
+    what = "did not exist" if lease.missing else "was not renewed"
     end = format_time(since + master.lost_grace_seconds)
     return (
         f"The Lease {master.lease_name} {what} for {master.lease_duration_seconds} s: "
         f"the master at {_whereabouts(master)} has ended or cannot reach the API server. "
-        f"{_FATE[pool.spec.on_lost].format(end=end)} Start it again to go on with this pool."
+        f"{_FATE[pool.spec.on_lost].format(end=end)} Start it again to use this pool."
     )
 
 
 def no_lease(pool: FiberPool) -> str:
-    """A Lease that is not there yet, or not any more."""
+    """Return the message of a Lease that does not exist."""
     master = pool.spec.master
     assert master is not None
     return (
-        f"There is no Lease {master.lease_name} in this namespace, so nobody can tell whether the "
-        f"master at {_whereabouts(master)} is alive. If it is not there for "
-        f"{master.lease_duration_seconds} s, that master counts as lost. Create it and renew it, "
-        "or correct spec.master.leaseName; without leaseName the master is not checked."
+        f"There is no Lease {master.lease_name} in this namespace, so it is not known whether the "
+        f"master at {_whereabouts(master)} is alive. After {master.lease_duration_seconds} s "
+        "without a Lease the master counts as lost. Create and renew the Lease, or correct "
+        "spec.master.leaseName. Without leaseName the master is not checked."
     )
 
 
@@ -362,31 +362,31 @@ def _whereabouts(master: MasterSpec) -> str:
 
 
 _FATE = {
-    "Delete": "onLost is Delete: the pool is deleted at {end} unless it comes back.",
-    "ScaleToMin": "onLost is ScaleToMin: the pool goes back to minReplicas at {end} unless it "
-    "comes back.",
+    "Delete": "onLost is Delete: the pool is deleted at {end} unless the master comes back.",
+    "ScaleToMin": "onLost is ScaleToMin: the pool goes back to minReplicas at {end} unless the "
+    "master comes back.",
     "Retain": "onLost is Retain: the workers stay and wait.",
 }
 
 
 def wrong_family(pool: FiberPool, address: str) -> str:
-    """A master that the Service cannot lead to."""
+    """Return the message of a master with another IP family than the Service."""
     master = pool.spec.master
     assert master is not None
     return (
-        f"The master's address {master.host} and the pool's Service ({address}) are not of the "
-        "same IP family, so that no worker can reach the master. In a cluster of both families, "
-        f"delete the Service {names.service_name(pool.metadata.name)}: the operator makes one of "
-        "both. Else let the master listen at an address of the Service's family and write that in "
+        f"The master's address {master.host} and the pool's Service ({address}) have "
+        "different IP families, so no worker can reach the master. If the cluster has both, "
+        f"delete the Service {names.service_name(pool.metadata.name)}: the operator makes one with "
+        "both. Else let the master listen at an address of the Service's family, and write that to "
         "spec.master.host."
     )
 
 
 def foreign_releases(pool: FiberPool, foreign: list[str]) -> str:
-    """Names that can be no pods of the pool."""
+    """Return the message of released names that cannot be pods of the pool."""
     return (
-        f"spec.scaleDown.release names what is no worker of this pool: {', '.join(foreign[:3])}. "
-        "Nothing is deleted for these. Workers are called "
+        f"spec.scaleDown.release has names of no worker of this pool: {', '.join(foreign[:3])}. "
+        "No pod is deleted for them. The names of workers are "
         f"{pool.metadata.name}-<{names.POD_SUFFIX_LENGTH} hexadecimal digits>."
     )
 
@@ -395,31 +395,31 @@ def foreign_releases(pool: FiberPool, foreign: list[str]) -> str:
 
 _RIGHTS = (
     "Give the operator's account this right, as the chart's roles do, or change the policy or the "
-    "quota that forbids it; the operator tries again by itself."
+    "quota that forbids it. The operator tries again by itself."
 )
 _WEBHOOKS = (
-    "The operator tries again by itself. If this stays, look for an admission webhook for {what} "
-    "that is down or slow (kubectl get mutatingwebhookconfigurations,"
-    "validatingwebhookconfigurations), and at the API server itself."
+    "The operator tries again by itself. If the problem stays, look for an admission webhook for "
+    "{what} that is down or slow (kubectl get mutatingwebhookconfigurations,"
+    "validatingwebhookconfigurations), and check the API server."
 )
-_SCHEMA = "Bring the CustomResourceDefinition of FiberPools to the operator's release."
-_SERVER = "The operator tries again by itself; if this stays, look at the API server."
+_SCHEMA = "Upgrade the CustomResourceDefinition of FiberPools to the operator's release."
+_SERVER = "The operator tries again by itself. If the problem stays, check the API server."
 
 
 def object_obstacle(error: ApiError, what: str) -> Obstacle:
-    """An object that the pool needs could not be had; ``what`` names it."""
+    """Return the obstacle after an object could not be read or created; ``what`` names it."""
     if isinstance(error, Refused):
         return _forbidden(error, f"for {what}")
     if isinstance(error, Invalid):
         message = (
             f"The API server refuses to {error.call} for {what}{quoted(error.message)}. The pool "
-            "needs it: remove what refuses it, a policy or a webhook for instance."
+            "needs this object: change the policy or the webhook that refuses it."
         )
         return Obstacle(Reason.FORBIDDEN, message)
     remedy = _WEBHOOKS.format(what=error.call.split()[-1]) if error.writes else _SERVER
     message = (
-        f"The call to {error.call} for {what} failed{quoted(error.message)}. Workers that run go "
-        f"on; none is made meanwhile. {remedy}"
+        f"The call to {error.call} for {what} failed{quoted(error.message)}. Running workers go "
+        f"on; no new ones are created meanwhile. {remedy}"
     )
     return Obstacle(Reason.API_UNAVAILABLE, message)
 
@@ -427,7 +427,7 @@ def object_obstacle(error: ApiError, what: str) -> Obstacle:
 def creation_obstacle(error: ApiError) -> Obstacle:
     """Return the obstacle after a failed creation of a pod."""
     message = (
-        f"The API server does not make workers{quoted(error.message)}. Those that run go on. "
+        f"The API server does not create workers{quoted(error.message)}. Running workers go on. "
         f"{_WEBHOOKS.format(what='pods')}"
     )
     return Obstacle(Reason.API_UNAVAILABLE, message)
@@ -436,17 +436,17 @@ def creation_obstacle(error: ApiError) -> Obstacle:
 def deletion_obstacle(error: ApiError) -> Obstacle:
     """Return the obstacle after a failed deletion."""
     if isinstance(error, Refused | Invalid):
-        return _forbidden(error, "to remove what is not wanted any more")
+        return _forbidden(error, "to delete objects that are not wanted")
     message = (
-        f"The call to {error.call} failed{quoted(error.message)}, and what is not wanted any more "
-        f"is still there. {_WEBHOOKS.format(what=error.call.split()[-1])}"
+        f"The call to {error.call} failed{quoted(error.message)}. The unwanted object still "
+        f"exists. {_WEBHOOKS.format(what=error.call.split()[-1])}"
     )
     return Obstacle(Reason.API_UNAVAILABLE, message)
 
 
 def list_obstacle(error: ApiError) -> Obstacle:
     """Return the obstacle after a failed list of pods."""
-    blind = "Until they are known none is made or deleted, and the numbers are those of before."
+    blind = "Until then no worker is created or deleted, and the status shows the old numbers."
     if isinstance(error, Refused | Invalid):
         return _forbidden(error, "to see the pool's workers", blind)
     message = f"The pool's workers cannot be listed{quoted(error.message)}. {blind} {_SERVER}"
@@ -454,21 +454,21 @@ def list_obstacle(error: ApiError) -> Obstacle:
 
 
 def unreadable_lease(pool: FiberPool, words: str) -> str:
-    """Return the words for a Lease that cannot be read."""
+    """Return the message of a Lease that the operator may not read."""
     lease = pool.spec.master.lease_name if pool.spec.master else None
     return (
-        f"The operator may not get leases, so that nobody sees whether the master renews the Lease "
-        f"{lease}{quoted(words)}. Until then onLost ({pool.spec.on_lost}) is never applied"
-        f", and a pool whose master is gone stays. {_RIGHTS}"
+        f"The operator may not get leases, so it does not see whether the master renews the Lease "
+        f"{lease}{quoted(words)}. Until it can, onLost ({pool.spec.on_lost}) is not applied, and "
+        f"a pool whose master is gone stays. {_RIGHTS}"
     )
 
 
 def unwritable_status(error: ApiError) -> str:
-    """The status cannot be written; an event is all that is left to tell it."""
+    """Return the message of an event that reports that the status cannot be written."""
     remedy = _RIGHTS if isinstance(error, Refused) else _SCHEMA
     return (
-        f"What the status of this pool says is out of date: {error}. Nothing is made or deleted "
-        f"until it can be written. {remedy}"
+        f"The status of this pool is out of date, because it cannot be written: {error}. Until it "
+        f"can, no pod is created or deleted. {remedy}"
     )
 
 

@@ -21,77 +21,77 @@ PROBE_PROGRAM = f"{names.CREDENTIALS_DIRECTORY}/{names.PROBE_PROGRAM}"
 """Command by which a worker's startup probe is recognized as the operator's."""
 
 LONGEST_MESSAGE = 1000
-"""Characters that are kept of what the cluster says, its end: there the cause of a traceback is."""
+"""Characters that are kept from the end of a message.  A traceback has its cause at the end."""
 
 
 class PodState(StrEnum):
-    """State of a pod.  ``TERMINATING`` and ``ENDED`` pods are not live."""
+    """State of a pod.  All are live except ``TERMINATING`` and ``ENDED``."""
 
     PENDING = "Pending"
-    """Worker container that does not run yet."""
+    """The worker container does not run yet."""
     STARTING = "Starting"
-    """The container runs; the pod was never seen Ready."""
+    """The container runs, and the pod has never been Ready."""
     READY = "Ready"
     NOT_READY = "NotReady"
-    """Was Ready and is not now: the node is silent, or a probe fails."""
+    """The pod was Ready and is not now: its node is silent, or a probe fails."""
     TERMINATING = "Terminating"
-    """Somebody asked to delete it."""
+    """The pod is being deleted."""
     ENDED = "Ended"
-    """Phase Failed or Succeeded, or its worker container has ended for good."""
+    """The phase is Failed or Succeeded, or the worker container has ended for good."""
 
 
 class Trouble(StrEnum):
     """Trouble of a pod, by its consequence."""
 
     DISRUPTED = "Disrupted"
-    """The cluster ended it: replaced at once, no failure."""
+    """The cluster ended the pod: replaced at once, not counted as a failure."""
     COMPLETED = "Completed"
-    """The worker ended with exit code 0 after a while: replaced like one that failed, but the pool
-    is not given up for it."""
+    """The worker ended with exit code 0 after it had worked: replaced like a failed one, but no
+    reason to give up the pool."""
     APPLICATION = "Application"
-    """The worker failed, or ended at once: counted, and replaced after a while."""
+    """The worker failed or ended at once: counted, and replaced after a delay."""
     CANNOT_START = "CannotStart"
-    """Image or configuration; the kubelet retries, so the pod is kept."""
+    """The image or the configuration is wrong.  The kubelet retries, so the pod is kept."""
     UNSCHEDULABLE = "Unschedulable"
-    """No node takes it now; the scheduler retries, so the pod is kept."""
+    """No node takes the pod now.  The scheduler retries, so the pod is kept."""
 
 
 @dataclass(frozen=True, slots=True)
 class PodView:
-    """View of a pod.  Times are unix seconds as the cluster wrote them; 0.0 where it wrote none."""
+    """View of a pod.  Times are unix seconds as the cluster wrote them; 0.0 if there is none."""
 
     name: str
     uid: str
     resource_version: str
     owner: str
-    """The uid of the controller that owns it; empty if none does."""
+    """Uid of the controller that owns the pod; empty if there is none."""
     created: float
     template_hash: str
     state: PodState
     since: float
-    """Time at which it came into this state, as far as the cluster says."""
+    """Time at which the pod came into this state, as far as the cluster says."""
     was_ready: bool = False
     """True if the pod is or was Ready, as far as its conditions tell."""
     joining: bool = False
-    """True if the pod runs and its agent has not reached a master yet.  This is only shown: plans
-    count such a pod as ``READY``."""
+    """True if the pod runs and its agent has not reached a master yet.  Only the status shows it;
+    plans count such a pod as ``READY``."""
     trouble: Trouble | None = None
     reason: str = ""
-    """The cluster's own word for the trouble: ``ErrImagePull``, ``OOMKilled``, ``Evicted``."""
+    """Cluster's word for the trouble: ``ErrImagePull``, ``OOMKilled``, ``Evicted``."""
     message: str = ""
-    """The cluster's own words: the kubelet's, the scheduler's, or the worker's last lines."""
+    """Message of the kubelet or the scheduler, or the worker's last lines."""
     exit_code: int | None = None
     ran: float = 0.0
     """Seconds that the worker container ran, once it has ended."""
     scheduled: bool = False
     """True if the pod has a node."""
     lingers: bool = False
-    """The worker has ended but other containers of the pod have not."""
+    """True if the worker has ended and other containers of the pod have not."""
     deletion_cost: int = 0
     address: str = ""
-    """Address that the agent dials; empty if the pod does not state it."""
+    """Address that the agent dials; empty if the pod does not state one."""
     init_container: str = ""
-    """The init container that failed, so that the worker never ran; empty if none did."""
+    """Init container that failed, so that the worker never ran; empty if none failed."""
 
     @property
     def live(self) -> bool:
@@ -100,7 +100,7 @@ class PodView:
 
 
 def observe(pod: Mapping[str, Any], container: str) -> PodView:
-    """Return the view of ``pod``, judged by its container of that name.  Never raises."""
+    """Return the view of ``pod``, judged by the container of that name.  Never raises."""
     return _Observation(pod, container).view()
 
 
@@ -118,10 +118,10 @@ def worker_container(pod: Mapping[str, Any]) -> str:
     return names.WORKER_CONTAINER
 
 
-# The kubelet's words for a container that waits though nothing is on its way.  It goes on trying.
+# The kubelet's reasons for a container that cannot start.  The kubelet goes on trying.
 _CANNOT_START = frozenset(
     {
-        "CrashLoopBackOff",  # only a restartable init container can have it in our pods
+        "CrashLoopBackOff",  # in a worker's pod only a restartable init container can have it
         "CreateContainerConfigError",
         "CreateContainerError",
         "ErrImageNeverPull",
@@ -168,8 +168,8 @@ class _Observation:
         self._created = seconds(self._meta.get("creationTimestamp"))
 
     def view(self) -> PodView:
-        """All of it."""
-        state = self._life()
+        """Return the view."""
+        state = self._pod_state()
         trouble, reason, message = self._trouble(state)
         return PodView(
             name=text(self._meta.get("name")),
@@ -194,9 +194,9 @@ class _Observation:
             init_container="" if self._end else text(self._failed_init().get("name")),
         )
 
-    # Where it is in its life
+    # The state
 
-    def _life(self) -> PodState:
+    def _pod_state(self) -> PodState:
         if self._meta.get("deletionTimestamp"):
             return PodState.TERMINATING
         if self._phase in ("Failed", "Succeeded") or self._end:
@@ -219,13 +219,13 @@ class _Observation:
         )
 
     def _was_ready(self) -> bool:
-        # The kubelet writes "not Ready" when it takes the pod, before any container runs; a later
-        # change to "not Ready" means that the pod was Ready between.
+        # The kubelet writes "not Ready" when it takes the pod, before any container runs.  A later
+        # change to "not Ready" means that the pod was Ready in between.
         if self._ready():
             return True
         running = self._state.get("running")
         if isinstance(running, Mapping) and self._condition("Ready").get("status") != "False":
-            return True  # nobody can tell: it must not be taken for one that never worked
+            return True  # not known: the pod must not count as one that never worked
         started = seconds(mapping(running or self._end).get("startedAt"))
         return 0 < started < seconds(self._condition("Ready").get("lastTransitionTime"))
 
@@ -243,7 +243,7 @@ class _Observation:
         return self._created
 
     def _ending(self) -> Mapping[str, Any]:
-        """Return how the worker ended or, if it never ran, how the init container did."""
+        """Return the end of the worker or, if it never ran, of the init container that failed."""
         if self._end:
             return self._end
         return _end(self._failed_init().get("state"))
@@ -256,11 +256,11 @@ class _Observation:
         return max(0.0, finish - start) if start else 0.0
 
     def _others_go_on(self) -> bool:
-        # For up to a second after the last container's end the kubelet leaves the phase as it was.
+        # The kubelet updates the phase up to a second after the last container's end.
         over = all(_end(status.get("state")) for status in self._others)
         return not over and self._phase not in ("Failed", "Succeeded")
 
-    # What is wrong with it
+    # The trouble
 
     def _trouble(self, state: PodState) -> tuple[Trouble | None, str, str]:
         if state is PodState.ENDED:
@@ -294,13 +294,13 @@ class _Observation:
         if self._disruption() or reason in names.DISRUPTIONS or lost:
             return Trouble.DISRUPTED, *self._disruption_words()
         if reason and not end:
-            # The node turned it away (OutOfcpu, UnexpectedAdmissionError, ...).  The next one may
-            # fare the same, so these are replaced with back-off.
+            # The node refused the pod (OutOfcpu, UnexpectedAdmissionError, ...) and may refuse the
+            # next one, so such pods are replaced after a delay.
             return Trouble.APPLICATION, reason, message
         return self._by_exit_code(end)
 
     def _by_exit_code(self, end: Mapping[str, Any]) -> tuple[Trouble, str, str]:
-        # An ended pod without any exit code was deleted with its node's records.
+        # An ended pod without an exit code was lost with its node's records.
         if not end and self._phase != "Succeeded":
             return Trouble.DISRUPTED, "", text(self._status.get("message"))
         message = text(end.get("message"))
@@ -313,7 +313,7 @@ class _Observation:
         return Trouble.APPLICATION, reason or "Error", message
 
     def _exceeded_own_limit(self) -> bool:
-        # Eviction for what the pod itself did: the next one would do it again.
+        # The pod itself caused the eviction: the next one would do so again.
         message = text(self._status.get("message"))
         return (
             self._status.get("reason") == "Evicted"
@@ -330,7 +330,7 @@ class _Observation:
         message = text(self._status.get("message")) or text(condition.get("message"))
         end = self._ending()
         cause = text(end.get("reason"))
-        # Else it is the worker's own output, which says nothing of what has ended it.
+        # The message of any other end is the worker's output, which does not say what ended it.
         words = text(end.get("message")) if cause in names.LOST_CONTAINERS else ""
         return reason or cause, message or words
 
@@ -362,11 +362,11 @@ class _Observation:
         try:
             return int(cost or "0")
         except ValueError:
-            return 0  # Kubernetes ignores it too
+            return 0  # Kubernetes ignores it, too
 
 
 def _end(state: object) -> Mapping[str, Any]:
-    """Return how a container ended; empty if it has not, or if its exit code is not known."""
+    """Return the end of a container; empty if it runs or if its exit code is not known."""
     end = mapping(state, "terminated")
     return end if _exit_code(end) is not None else {}
 
@@ -383,7 +383,7 @@ def _shorten(message: str) -> str:
 
 
 def _awaits_its_agent(worker: Mapping[str, Any], status: Mapping[str, Any]) -> bool:
-    """Return whether nothing but its agent's link is missed of the container with this status."""
+    """Return True if the container with this status only waits for its agent's link."""
     if status.get("started") is not False or worker.get("readinessProbe"):
         return False
     command = mapping(worker, "startupProbe", "exec").get("command")

@@ -5,7 +5,7 @@ the API server's complaint about it is the better one.  The operator alone sets 
 the environment variable with that name, the owner, Fiber's labels, the absence of finalizers, and
 ``restartPolicy: Never``.
 
-An init container gives each agent a key of its own and hides the pool's key from tasks.  It mounts
+An init container gives each agent a separate key and hides the pool's key from tasks.  It mounts
 the pool's Secret, derives the agent's key from it and the pod's name and uid, and writes that key
 to a volume in memory.  The agent reads the file and removes it.  The init container runs the
 worker's command on the worker's image, without the volumes, environment and working directory of
@@ -31,8 +31,8 @@ from fiber_operator.planning.manifests import owner_reference, template_hash
 from fiber_operator.planning.pods import PROBE_PROGRAM
 
 NODE_LOST_SECONDS = 60
-"""Seconds for which a pod stays bound to a silent node.  Kubernetes' default is five minutes.  A
-worker's tasks go to others after seconds, and the pool should not lack the worker for longer."""
+"""Seconds for which a pod stays bound to a silent node.  Kubernetes' default is five minutes.  The
+worker's tasks go to other workers after seconds, and the pool should get a new worker soon, too."""
 
 _NODE_LOST = ("node.kubernetes.io/not-ready", "node.kubernetes.io/unreachable")
 _EVICTION = "NoExecute"
@@ -40,7 +40,7 @@ _EVICTION = "NoExecute"
 _LOST_GRACE: int = MasterSpec.model_fields["lost_grace_seconds"].default
 
 _TERMINATION_GRACE = 30
-"""Seconds, where the template does not say: Kubernetes' own default."""
+"""Kubernetes' default of ``terminationGracePeriodSeconds``."""
 
 _POD = frozenset({"apiVersion", "kind", "metadata", "spec", "status"})
 _POD_METADATA = frozenset(
@@ -62,7 +62,7 @@ _POD_METADATA = frozenset(
         "uid",
     }
 )
-"""Fields that a pod has.  Any other is passed on too: the API server says that it is misspelt."""
+"""Fields of a pod's metadata.  Others are passed on: the API server reports misspelt fields."""
 
 _TMP = "/tmp"
 _TMP_VOLUME = "fiber-tmp"
@@ -76,7 +76,7 @@ def pod(
 ) -> dict[str, Any]:
     """Return a worker pod.  ``address`` is ``host:port`` of the pool's Service.
 
-    ``requests`` says what a worker requests of a resource that the template says nothing of.
+    ``requests`` are requests for resources that the template does not mention.
     """
     return pod_maker(pool, address, requests)(name)
 
@@ -84,10 +84,10 @@ def pod(
 def pod_maker(
     pool: FiberPool, address: str, requests: Mapping[str, str] = NO_REQUESTS
 ) -> Callable[[str], dict[str, Any]]:
-    """Makes worker pods by name: what is costly is done once for all of them."""
+    """Return a function that makes a worker pod by name, with costly work done only once."""
     revision = template_hash(pool)
     if pool.metadata.labels.get(names.LABEL_MANAGED_BY) == names.SDK_MANAGER:
-        requests = NO_REQUESTS  # a program has settings for that
+        requests = NO_REQUESTS  # a program has its own settings for these
     return lambda name: _pod(pool, name, address, revision, requests)
 
 
@@ -98,7 +98,7 @@ def _pod(
     spec = dict(mapping(template, "spec"))
     spec["restartPolicy"] = "Never"
     _default(spec, "automountServiceAccountToken", False)
-    # Else each worker gets variables for each Service of the namespace, two of every pool.
+    # Else each worker would get environment variables for each Service of the namespace.
     _default(spec, "enableServiceLinks", False)
     spec["tolerations"] = _tolerations(spec.get("tolerations"))
     _secure(spec)
@@ -150,7 +150,7 @@ def _tolerations(own: object) -> object:
     if own is not None and not isinstance(own, list):
         return own
     listed = list(own or ())
-    # A toleration without a key is one of every key, and so with the effect.
+    # A toleration without a key or effect tolerates every key or effect.
     keys = {text(t.get("key")) for t in items(listed) if text(t.get("effect")) in ("", _EVICTION)}
     if "" in keys:
         return listed
@@ -166,7 +166,7 @@ def _tolerations(own: object) -> object:
     ]
 
 
-# Security: what the "restricted" level of Kubernetes' pod security standards asks for.
+# Security, as the "restricted" level of Kubernetes' pod security standards demands.
 
 
 def _secure(spec: dict[str, Any]) -> None:
@@ -186,7 +186,7 @@ def _secure_container(container: dict[str, Any], *, root_is_welcome: bool) -> No
     if not isinstance(context, dict) or context.get("privileged"):
         return
     if context.get("runAsUser") == 0:
-        # The kubelet would refuse it for the pod's runAsNonRoot.
+        # Else the kubelet would refuse it because of the pod's runAsNonRoot.
         _default(context, "runAsNonRoot", False)
     non_root = context.get("runAsNonRoot")
     root = root_is_welcome if non_root is None else not non_root
@@ -222,18 +222,18 @@ def _equip(spec: dict[str, Any], container: dict[str, Any], variables: Mapping[s
     _default(container, "terminationMessagePolicy", "FallbackToLogsOnError")
     _add_environment(container, variables)
     if mapping(container, "securityContext").get("readOnlyRootFilesystem") is True:
-        # The agent's sockets are in /tmp, and Python's temporary files.  Where the root can be
-        # written to, the image's own /tmp does, with what the image may have put there.
+        # The agent's sockets and Python's temporary files are in /tmp.  With a writable root the
+        # image's /tmp is used, together with its files.
         _mount(spec, container, {"name": _TMP_VOLUME, "emptyDir": {}}, _TMP)
 
 
 def _request(
     spec: Mapping[str, Any], container: dict[str, Any], requests: Mapping[str, str]
 ) -> None:
-    """Request what neither the container nor the pod as a whole speaks of."""
+    """Add requests for resources that neither the container nor the pod mentions."""
     resources = container.get("resources")
     asked = mapping(resources, "requests")
-    # A limit is the request, too, if there is no other.
+    # A limit is also the request if there is no request.
     said = {
         *asked,
         *mapping(resources, "limits"),
@@ -249,11 +249,11 @@ def _add_environment(container: dict[str, Any], variables: Mapping[str, str]) ->
     own = container.get("env")
     if own is not None and not isinstance(own, list):
         return
-    # An agent by another name than its pod's could never be released.
+    # An agent with another name than its pod's could never be released.
     own = [v for v in own or () if not (isinstance(v, Mapping) and v.get("name") == names.ENV_NAME)]
     uid = {"fieldRef": {"apiVersion": "v1", "fieldPath": "metadata.uid"}}
     taken = {text(variable.get("name")) for variable in items(own)}
-    # Ours first, so that the user's may refer to them.
+    # Fiber's variables first, so that the user's may refer to them.
     added: list[dict[str, Any]] = [
         {"name": key, "value": value} for key, value in variables.items()
     ]
@@ -272,7 +272,7 @@ def _mount(
     volume: dict[str, Any],
     path: str,
 ) -> None:
-    """Mount a volume, unless the template has one of that name or mounts something there."""
+    """Mount a volume, unless the template has a volume of that name or a mount at that path."""
     volumes, mounts = spec.get("volumes") or [], container.get("volumeMounts") or []
     if not isinstance(volumes, list) or not isinstance(mounts, list):
         return
@@ -285,7 +285,7 @@ def _mount(
 
 
 def _default(document: dict[str, Any], key: str, value: Any) -> Any:
-    """Set a field that is absent or null, which is the same to the API server."""
+    """Set a field if it is absent or null, which are the same to the API server."""
     if document.get(key) is None:
         document[key] = value
     return document[key]
@@ -310,15 +310,16 @@ _LIKE_THE_WORKER = (
 _AGENT = "fiber.agent"
 
 _ASKED_FOR = ("cpu", "memory", "ephemeral-storage")
-"""A pod asks for the larger of what its init containers and its containers ask for: as much as the
-worker does costs nothing, and meets every quota and limit range that the worker meets.  A device is
-of no use here."""
+"""Resources that the init container requests as the worker does.
+
+A pod requests the maximum of its init containers and its containers, so this costs nothing, and it
+meets every quota and limit range that the worker meets.  Devices are not needed."""
 
 _CREDENTIALS = f"{names.CREDENTIALS_DIRECTORY}/{names.CREDENTIALS_FILE}"
 
 
 def _add_identity_container(pool: FiberPool, spec: dict[str, Any], worker: dict[str, Any]) -> None:
-    """Give the pod its init container, and what the worker's ``container`` mounts for it."""
+    """Add the init container to the pod, and its mount to the ``worker`` container."""
     volumes, first = spec.get("volumes") or [], spec.get("initContainers") or []
     mounts = worker.get("volumeMounts") or []
     if not (isinstance(volumes, list) and isinstance(first, list) and isinstance(mounts, list)):
@@ -326,12 +327,12 @@ def _add_identity_container(pool: FiberPool, spec: dict[str, Any], worker: dict[
     if any(
         text(m.get("mountPath")).rstrip("/") == names.CREDENTIALS_DIRECTORY for m in items(mounts)
     ):
-        return  # the template's own way to hand credentials over
+        return  # the template provides the credentials
     spec["volumes"] = [
         *volumes,
         {
             "name": names.KEY_VOLUME,
-            # Any user may read it that the image runs as; no other container mounts it.
+            # The image may run as any user, so all may read the file; no other container mounts it.
             "secret": {"secretName": pool.credentials_secret, "defaultMode": 0o444},
         },
         {"name": names.CREDENTIALS_VOLUME, "emptyDir": {"medium": "Memory", "sizeLimit": "1Mi"}},
@@ -366,7 +367,7 @@ def _identity_container(worker: Mapping[str, Any], written: Mapping[str, Any]) -
 def _mounts_of_the_interpreter(
     worker: Mapping[str, Any], made: Mapping[str, Any]
 ) -> Iterator[dict[str, Any]]:
-    """The mounts without which the command could not run: it names a path on them."""
+    """Yield the mounts that the command needs because it names a path on them."""
     command = str([made.get("command"), made.get("args")])
     for mount in items(worker.get("volumeMounts")):
         path = text(mount.get("mountPath")).rstrip("/")
@@ -375,7 +376,7 @@ def _mounts_of_the_interpreter(
 
 
 def _runs_the_agent(worker: Mapping[str, Any]) -> bool:
-    """Tell whether the worker container runs the agent, by its command or its image."""
+    """Return True if the worker container runs the agent, by its command or its image."""
     words = [worker.get("command"), worker.get("args")]
     return not any(words) or _AGENT in str(words)
 
@@ -405,20 +406,20 @@ for _ in range(200):
     time.sleep(0.1)
 sys.exit("no master has answered the agent yet; the log of the pod may say why")
 """
-"""Command of the probe.  A sleeping process is cheaper than a process each second, and faster."""
+"""Program of the probe.  One sleeping process is cheaper and faster than one process a second."""
 
 _PROBE: Mapping[str, Any] = {
-    # Without the site module an interpreter needs a hundredth of a second.
+    # Without the site module the interpreter starts in a hundredth of a second.
     "exec": {"command": [PROBE_PROGRAM, "-ISc", _SCRIPT, _LINKED_FILE]},
-    "initialDelaySeconds": 1,  # the processor is the agent's while that starts
+    "initialDelaySeconds": 1,  # leaves the processor to the starting agent
     "periodSeconds": 2,
     "timeoutSeconds": 30,
-    "failureThreshold": 2**31 - 1,  # it ends no pod
+    "failureThreshold": 2**31 - 1,  # the probe must not end a pod
 }
 
 
 def _add_startup_probe(pool: FiberPool, spec: Mapping[str, Any], worker: dict[str, Any]) -> None:
-    """Give the worker's ``container`` the probe, where its agent is known to be one of ours."""
+    """Add the probe to the ``worker`` container if that is known to run Fiber's agent."""
     first = next(items(spec.get("initContainers") or ()), {})
     if first.get("name") != names.IDENTITY_CONTAINER or not _runs_the_agent(worker):
         return

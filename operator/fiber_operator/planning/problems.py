@@ -24,14 +24,14 @@ from fiber_operator.planning.pods import PodState, PodView, Trouble
 # -- The situation
 
 SECOND_LOOK = 30.0
-"""Seconds after which what may pass by itself has not."""
+"""Seconds after which a problem that may pass by itself counts as an error."""
 
 Severity = Literal["Error", "Warning"]
 
 
 @dataclass(frozen=True)
 class Situation:
-    """All that there may be to complain about."""
+    """Facts about a pool from which its problems follow."""
 
     pool: FiberPool
     live: Sequence[PodView]
@@ -41,29 +41,29 @@ class Situation:
     knowledge: Knowledge
     template_hash: str
     wants_more: bool
-    """Pods are missing, whether or not they may be created now."""
+    """True if pods are missing, also if they may not be created now."""
     creates: bool
-    """Pods, or a dry run of one, are asked for now."""
+    """True if pods are created now, or one in a dry run."""
     deletes: bool
-    """Something is to be deleted now."""
+    """True if a pod or the pool is deleted now."""
     now: float
 
     def previous(self, reason: str) -> Problem | None:
-        """The problem of that kind that the status shows."""
+        """Return the problem with that reason from the status."""
         found = next((p for p in self.pool.status.problems if p.reason == reason), None)
         if found is None or past(found.since, self.now) is not None:
             return found
         return found.model_copy(update={"since": float(math.floor(self.now))})
 
     def severity(self, reason: str, *, again: bool = False) -> Severity:
-        """Return the severity of a passing problem: at first a warning, an error ``again``."""
+        """Return the severity of a problem that may pass: first a warning, ``again`` an error."""
         before = self.previous(reason)
         lasted = before and before.since and self.now - before.since >= SECOND_LOOK
         was_error = before is not None and before.severity == "Error"
         return "Error" if again or lasted or was_error else "Warning"
 
     def example(self, reason: str, pods: Iterable[PodView]) -> PodView:
-        """The pod to name: the one that was named before, else the oldest."""
+        """Return the pod to name: the one that the status names, else the oldest."""
         before = self.previous(reason)
         named = before.pod if before else None
         return min(pods, key=lambda pod: (pod.name != named, pod.created, pod.name))
@@ -78,7 +78,7 @@ class Situation:
         count: int = 1,
         pod: str | None = None,
     ) -> Problem:
-        """A problem, since when it is there."""
+        """Return a problem, with the time since which it exists."""
         before = self.previous(reason)
         since = before.since if before else None
         return Problem(
@@ -98,7 +98,7 @@ _WORKER_NAME = re.compile(f"[0-9a-f]{{{names.POD_SUFFIX_LENGTH}}}")
 
 
 def find(situation: Situation) -> tuple[Problem, ...]:
-    """Worst first, one of a kind, at most ten."""
+    """Return the problems, the worst first: one for each reason, at most ten."""
     kinds: dict[str, Problem] = {}
     for problem in _all(situation):
         kinds.setdefault(problem.reason, problem)
@@ -113,7 +113,7 @@ def _all(situation: Situation) -> Iterator[Problem]:
     yield from _refusals(situation)
     yield from failed_pods(situation)
     yield from pods_that_do_not_start(situation)
-    yield from pods_not_ready_any_more(situation)
+    yield from pods_no_longer_ready(situation)
     yield from _cut_off(situation)
     yield from _masters(situation)
     yield from _releases(situation)
@@ -141,7 +141,7 @@ def _refusals(situation: Situation) -> Iterator[Problem]:
     if refused is None or refused.template_hash != situation.template_hash:
         return
     if refused.namespace_ends:
-        return  # its pods went before the pool, which goes next
+        return  # the namespace deletes its pods before the pool, which follows
     reason = refused.reason
     if situation.wants_more or reason == Reason.INVALID_TEMPLATE:
         yield situation.problem(
@@ -246,7 +246,7 @@ def _cannot_start(situation: Situation, reason: Reason, pods: Sequence[PodView])
 
 
 def _says_less(message: str) -> bool:
-    # Older kubelets tell the cause at ErrImagePull and only that they wait at ImagePullBackOff.
+    # Older kubelets state the cause with ErrImagePull, but not with ImagePullBackOff.
     return message.startswith("Back-off pulling image") and ": " not in message
 
 
@@ -267,7 +267,7 @@ def _unschedulable(situation: Situation, pods: Sequence[PodView]) -> Iterator[Pr
 
 
 def _on_their_way(situation: Situation, pods: Sequence[PodView]) -> Iterator[Problem]:
-    """Pods that start, as far as their own status tells."""
+    """Yield the problems of pods that are starting according to their status."""
     for pod in pods:
         warning = situation.knowledge.warnings.get(pod.name, "")
         reason = warning.partition(":")[0]
@@ -283,8 +283,8 @@ def _on_their_way(situation: Situation, pods: Sequence[PodView]) -> Iterator[Pro
         yield situation.problem(Reason.STARTUP_TIMEOUT, message, count=len(overdue), pod=pod.name)
 
 
-def pods_not_ready_any_more(situation: Situation) -> Iterator[Problem]:
-    """Workers that were Ready, while Kubernetes has not given them up."""
+def pods_no_longer_ready(situation: Situation) -> Iterator[Problem]:
+    """Yield the problem of workers that were Ready and are not now."""
     pods = [pod for pod in situation.live if pod.state is PodState.NOT_READY]
     if pods:
         pod = situation.example(Reason.NOT_READY, pods)
@@ -320,7 +320,7 @@ def failed_pods(situation: Situation) -> Iterator[Problem]:
 
 
 def _last_completed(situation: Situation) -> Problem | None:
-    """Workers that end of themselves again and again."""
+    """Return the problem of workers that end by themselves again and again."""
     waves, newly = situation.account.failures.waves, situation.account.failed[-1:]
     if not newly or waves < 2:
         return situation.previous(Reason.COMPLETED)
@@ -347,7 +347,7 @@ def _last_failure(situation: Situation) -> Problem:
     newest = max(late or failed, key=lambda pod: (pod.since, pod.name), default=None)
     was_late = failures.last_reason == Reason.STARTUP_TIMEOUT and not late
     if newest is None or was_late:
-        # The pods are gone; what the status said of them is all that is left.
+        # The pods are gone: the problem comes from the status.
         kinds = (Reason.STARTUP_TIMEOUT,) if was_late else _FAILURES
         before = next(filter(None, map(situation.previous, kinds)), None)
         return before or situation.problem(kinds[0], messages.forgotten_failure(pool, failures))
@@ -382,7 +382,7 @@ _NO_PROGRAM = ("executable file not found", "no such file or directory", "exec f
 
 
 def _hopeless(pod: PodView) -> bool:
-    """Tell whether the image lacks the program, so that no later attempt can succeed."""
+    """Return True if the image lacks the program, so that no later attempt can succeed."""
     start_failed = failure_reason(pod) == Reason.RUN_CONTAINER_ERROR
     return start_failed and any(words in pod.message for words in _NO_PROGRAM)
 
@@ -391,7 +391,7 @@ def _hopeless(pod: PodView) -> bool:
 
 
 def _cut_off(situation: Situation) -> Iterator[Problem]:
-    """Yield the problems of pods that are cut off, but for those that go now."""
+    """Yield the problems of pods that are cut off and not deleted now."""
     found = find_cut_off(situation.pool, situation.live, situation.knowledge)
     if pods := found.by_address:
         pod = situation.example(Reason.ADDRESS_CHANGED, pods)
@@ -412,10 +412,10 @@ def _address_changed(situation: Situation, pod: PodView) -> str:
     pool = situation.pool.metadata
     return (
         f"Workers dial {pod.address}, which was the address of the Service "
-        f"{names.service_name(pool.name)} until somebody deleted it; it is "
-        f"{situation.knowledge.address} now, since the old one could not be had again. They reach "
-        f"no master any more than they have. {_REPLACED[situation.pool.spec.update.strategy]} To "
-        f"have new ones at once: {_delete(situation)}."
+        f"{names.service_name(pool.name)} until it was deleted. It is "
+        f"{situation.knowledge.address} now, because the old one is taken. These workers "
+        f"cannot connect to a master again. {_REPLACED[situation.pool.spec.update.strategy]} To "
+        f"get new ones at once: {_delete(situation)}."
     )
 
 
@@ -424,16 +424,19 @@ def _credentials_changed(situation: Situation) -> str:
     made = format_time(situation.knowledge.credentials_made)
     first, fate = "Delete the workers", _REPLACED[situation.pool.spec.update.strategy]
     if situation.master_state.attached:
-        first, fate = "Restart the master, which may hold the old ones too, and delete them", ""
+        first, fate = (
+            "Restart the master, which may hold the old keys, too, and delete the workers",
+            "",
+        )
     return " ".join(
         filter(
             None,
             (
-                f"The Secret {names.secret_name(pool.name)} was made anew at {made}, after "
-                "somebody had deleted it: workers hold keys of the old one, and a master "
-                "with the new ones refuses them.",
+                f"The Secret {names.secret_name(pool.name)} was made anew at {made}, "
+                "because it was deleted. Workers hold keys of the old one, and a master with "
+                "keys of the new one refuses them.",
                 fate,
-                f"{first}, to have new ones at once: {_delete(situation)}.",
+                f"{first} to get new ones at once: {_delete(situation)}.",
             ),
         )
     )
@@ -445,7 +448,7 @@ def _delete(situation: Situation) -> str:
 
 
 _REPLACED = {
-    "OnIdle": "Those that are not at work are replaced a few at a time.",
+    "OnIdle": "Idle ones are replaced a few at a time.",
     "Recreate": "They are replaced now.",
-    "OnDelete": "They stay until somebody deletes them (update.strategy is OnDelete).",
+    "OnDelete": "They stay until they are deleted (update.strategy is OnDelete).",
 }

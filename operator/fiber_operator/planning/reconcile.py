@@ -43,10 +43,10 @@ from fiber_operator.planning.status import Change, Outlook, PodCounts, events
 # -- Choice of pods
 
 CANARIES = 3
-"""Pods that try out a template that never worked."""
+"""Pods that try out a template of which no pod was ever Ready."""
 
 PATIENCE = 30.0
-"""Seconds after which canaries of which nothing bad is known are joined by as many again."""
+"""Seconds after which as many canaries again are created if none has a known problem."""
 
 
 def outdated_to_replace(
@@ -58,13 +58,13 @@ def outdated_to_replace(
     desired: int,
     proven: bool,
 ) -> list[PodView]:
-    """Pods of an older template that go now.
+    """Return the pods of an older template to delete now.
 
-    ``OnDelete``: none.  ``Recreate``: all, at work or not.  ``OnIdle``: those that do not run yet.
-    The others may be at work while a master is attached; it sees ``updatedReplicas`` and releases
-    them when they are idle.  Without one those that were never Ready go too, and the others a
-    quarter at a time, and no more than there may be canaries until the new template is ``proven``
-    to work.
+    ``OnDelete``: none.  ``Recreate``: all, with or without work.  ``OnIdle`` with an attached
+    master: those that do not run yet; the master sees ``updatedReplicas`` and releases the others
+    when they are idle.  ``OnIdle`` without a master: also those that were never Ready, and of the
+    Ready ones a quarter at a time.  Until the new template is ``proven`` to work, these are at
+    most as many as there are canaries.
     """
     outdated = [pod for pod in live if pod.template_hash != template_hash]
     if strategy == "OnDelete":
@@ -83,14 +83,14 @@ def outdated_to_replace(
 
 
 def _idle(pods: Sequence[PodView]) -> list[PodView]:
-    """Return the pods that no master can have given work to."""
+    """Return the pods that cannot have got work from a master."""
     return [pod for pod in pods if pod.state is PodState.PENDING]
 
 
 def expendable(pods: Sequence[PodView], template_hash: str) -> list[PodView]:
-    """The order in which policy ``Any`` takes pods.
+    """Return ``pods`` in the order in which policy ``Any`` deletes them.
 
-    Pending, then outdated, then not ready, then of the lowest deletion cost, then the newest.
+    Pending ones first, then outdated, not ready, those with the lowest deletion cost, the newest.
     """
     return sorted(
         pods,
@@ -108,7 +108,7 @@ def expendable(pods: Sequence[PodView], template_hash: str) -> list[PodView]:
 def excess_to_delete(
     live: Sequence[PodView], excess: int, *, template_hash: str, free_choice: bool
 ) -> list[PodView]:
-    """Pods that go because fewer are wanted; may be fewer than ``excess``."""
+    """Return the pods to delete because fewer are wanted.  They may be fewer than ``excess``."""
     if free_choice:
         candidates = expendable(live, template_hash)
     else:
@@ -119,10 +119,10 @@ def excess_to_delete(
 def released_to_delete(
     pods: Sequence[PodView], released: Collection[str], *, floor: int, template_hash: str
 ) -> list[PodView]:
-    """Pods that the master has released, but for those that would be made anew at once.
+    """Return the released pods, except those that would be created again at once.
 
-    A new worker in the place of an idle one would be as idle, and released in turn: the last
-    ``floor`` live ones stay.  Those of an older template go, for that is how it is updated.
+    The last ``floor`` live pods stay: a new worker in place of an idle one would be as idle, and
+    released in turn.  Released pods of an older template are deleted, because that updates them.
     """
     named = [pod for pod in pods if pod.name in released]
     current = [pod for pod in named if pod.live and pod.template_hash == template_hash]
@@ -133,25 +133,25 @@ def released_to_delete(
 
 @dataclass(frozen=True)
 class Trial:
-    """Number of pods of a template that may be added now."""
+    """Number of pods of an unproven template that may be created now."""
 
     room: int | None = None
-    """None: as many as are wanted."""
+    """None: no limit."""
     again: float | None = None
-    """Time at which there will be more room, if nothing happens until then."""
+    """Time at which more may be created if no pod changes until then."""
 
 
 def assess_trial(
     current: Sequence[PodView], *, proven: bool, failing: bool, held_back: int, now: float
 ) -> Trial:
-    """Judge whether a template with these ``current`` live pods is still being tried out.
+    """Return how many pods may join the ``current`` live pods of a template.
 
-    It is until one of its pods is Ready.  A pod that cannot start, or ``failing`` ones before
-    these, leave it at the canaries that there are, the places of failed ones that are ``held_back``
-    included.  While nothing is wrong their number doubles each ``PATIENCE``, for an image may take
-    long to fetch and fetching it on three nodes does not help the others.  Pods that no node takes
-    do not count, and let as many again ask for a node: a cluster autoscaler must see the whole
-    demand.
+    A template is tried out until one of its pods is Ready.  If a pod cannot start, or if earlier
+    ones are ``failing``, no more than ``CANARIES`` exist, including the failed ones that are
+    ``held_back``.  Otherwise their number doubles every ``PATIENCE`` seconds, because an image may
+    take long to fetch, and fetching it on three nodes does not help the others.  Pods that no node
+    takes do not count.  As many again may ask for a node, because a cluster autoscaler must see the
+    whole demand.
     """
     if proven:
         return Trial()
@@ -167,14 +167,14 @@ def assess_trial(
 
 
 KEPT = 3
-"""Failed pods that are kept for ``kubectl logs``."""
+"""Number of failed pods that are kept for ``kubectl logs``."""
 
 
 def ended_to_delete(ended: Sequence[PodView], settled: Collection[str]) -> list[PodView]:
-    """Ended pods that are of no more use: all that are ``settled``, which means counted if they
-    are to be, but the last that failed.
+    """Return the ended pods to delete: the ``settled`` ones except the last that failed.
 
-    A pod whose other containers go on is not kept: it would hold its resources.
+    A settled pod has been counted or need not be.  A pod whose other containers still run is not
+    kept, because it would hold its resources.
     """
     failed = sorted(
         (p for p in ended if p.trouble is Trouble.APPLICATION and not p.lingers),
@@ -187,7 +187,7 @@ def ended_to_delete(ended: Sequence[PodView], settled: Collection[str]) -> list[
 # -- The plan
 
 STUCK = 5.0
-"""Seconds after which a pod's events are looked at, if its status does not say why it waits."""
+"""Seconds after which a pod's events are read if its status does not say why it waits."""
 
 _ENDED: Mapping[Trouble | None, Reason] = {
     Trouble.COMPLETED: Reason.COMPLETED,
@@ -212,15 +212,15 @@ def plan(pool: FiberPool, pods: Sequence[PodView], knowledge: Knowledge, now: fl
 def plan_unreadable(
     document: Mapping[str, Any], pods: Sequence[PodView], errors: Sequence[str], now: float
 ) -> Plan:
-    """The plan for a pool whose spec the operator cannot read: say so, touch no pod.
+    """Return the plan for a pool with an invalid spec: write a status, change no pod.
 
-    ``document`` is the resource's JSON, ``errors`` what is wrong, each naming its field.
+    ``document`` is the resource's JSON.  Each of ``errors`` names a field and says what is wrong.
     """
     return Plan(status=status.describe_unreadable(document, pods, errors, now))
 
 
 def plan_blind(document: Mapping[str, Any], obstacle: Obstacle, now: float) -> Plan:
-    """The plan for a pool whose pods cannot be listed: say so, touch no pod."""
+    """Return the plan for a pool whose pods cannot be listed: write a status, change no pod."""
     described = status.describe_blind(document, obstacle, now)
     said = {text(p.get("reason")) for p in items(mapping(document, "status").get("problems"))}
     news = described is not None and obstacle.reason not in said
@@ -238,7 +238,7 @@ class _Planner:
         self._deletions: dict[str, Deletion] = {}
 
     def plan(self) -> Plan:
-        """The whole of it."""
+        """Return the plan."""
         if (
             self._facts.master_state.gone
             and self._spec.on_lost == "Delete"
@@ -262,7 +262,7 @@ class _Planner:
             dry_run=dry_run,
             template_hash=self._facts.template_hash,
             status=document,
-            events=tuple(events(change, told=document is not None)),
+            events=tuple(events(change, status_changes=document is not None)),
             inspect=tuple(self._to_inspect())[:1],
             requeue_at=self._requeue_at(found, trial_ends),
         )
@@ -282,7 +282,7 @@ class _Planner:
             events=(event,),
         )
 
-    # Who goes
+    # Deletions
 
     def _delete(self) -> None:
         facts, spec, attached = self._facts, self._spec, self._facts.master_state.attached
@@ -333,10 +333,10 @@ class _Planner:
     def _remaining(self) -> list[PodView]:
         return [pod for pod in self._facts.live if pod.name not in self._deletions]
 
-    # Who comes
+    # Creations
 
     def _hold_back(self) -> int:
-        """Places of workers that failed, which are not to be taken yet and are still wanted."""
+        """Return how many failed workers are still wanted and not to be replaced yet."""
         missing = max(0, self._facts.desired - len(self._remaining))
         found = self._account.failures
         if found.waiting > missing:
@@ -345,7 +345,7 @@ class _Planner:
         return min(self._account.held_back, missing)
 
     def _creations(self, held_back: int) -> tuple[int, float | None]:
-        """Return how many pods to create now, and when more may follow."""
+        """Return how many pods to create now, and the time at which more may follow."""
         missing = self._facts.desired - len(self._remaining) - held_back
         if missing <= 0 or not self._facts.may_create or not self._facts.accepted:
             return 0, None
@@ -363,7 +363,7 @@ class _Planner:
         complained = any(self._facts.knowledge.warnings.get(pod.name) for pod in pods)
         return complained or self._account.failures.waves > 0
 
-    # What to say
+    # Status
 
     def _situation(self, *, deletes: bool = False) -> Situation:
         facts, missing = self._facts, len(self._remaining) < self._facts.desired
@@ -403,16 +403,19 @@ class _Planner:
         return sum(pod.template_hash != self._facts.template_hash for pod in self._facts.live)
 
     def _to_inspect(self) -> Iterator[str]:
-        """Whose events may say more: what failed though it runs, for it goes now; then others."""
+        """Yield the pods whose events may explain a problem, most important first.
+
+        Those that count as failed though they run come first, because they are deleted now.
+        """
         yield from (p.name for p in self._account.failed[-1:] if p.state is not PodState.ENDED)
         yield from (p.name for p in self._silent() if self._facts.now >= p.created + STUCK)
 
     def _silent(self) -> list[PodView]:
-        """Pods with a node that do not get Ready and whose status does not say why."""
+        """Return pods that have a node and are not Ready, and whose status does not say why."""
         return [p for p in self._remaining if not p.was_ready and p.scheduled and not p.trouble]
 
     def _next_inspection(self, pod: PodView) -> float:
-        """Less and less often: a large image can take long."""
+        """Return the time of the next look at a pod's events; the intervals double."""
         age = STUCK
         while pod.created + age <= self._facts.now:
             age *= 2

@@ -35,15 +35,15 @@ class PodCounts:
     live: int
     ready: int
     joining: int
-    """Pods that run, and whose agents have not reached a master yet."""
+    """Pods that run and whose agents have not reached a master yet."""
     pending: int
-    """Live and never Ready."""
+    """Live pods that were never Ready."""
     terminating: int
     updated: int
 
     @classmethod
     def of(cls, pods: Sequence[PodView], desired: int, template_hash: str) -> PodCounts:
-        """Count them."""
+        """Count ``pods`` by their states."""
         live = [pod for pod in pods if pod.live]
         return cls(
             desired=desired,
@@ -58,32 +58,32 @@ class PodCounts:
 
 @dataclass(frozen=True)
 class Outlook:
-    """State of the pool, and what is about to happen."""
+    """State of the pool, and the work of the plan."""
 
     counts: PodCounts
     problems: tuple[Problem, ...]
     master_state: MasterState
     judged: bool = True
-    """True if the API server has judged the template, as far as that matters."""
+    """False while a dry run of the template is needed."""
     create: int = 0
     delete: int = 0
-    """Live pods that go now."""
+    """Live pods that are deleted now."""
     waits_until: float | None = None
-    """Workers that failed are not replaced before this time."""
+    """Time before which failed workers are not replaced."""
     draining: int = 0
-    """Workers more than wanted, of which only the master may say which are idle."""
+    """Number of surplus workers; only the master knows which are idle."""
     replacing: int = 0
-    """Live pods of an older template that are to be replaced, now or when they are idle."""
+    """Live pods of an older template that will be replaced, now or when they are idle."""
     lease_unreadable: bool = False
-    """True if there is no right to read the master's Lease."""
+    """True if the operator lacks the right to read the master's Lease."""
 
     @property
     def worst(self) -> Problem | None:
-        """The first problem that is an error."""
+        """First problem with severity Error."""
         return next((p for p in self.problems if p.severity == "Error"), None)
 
     def problem(self, *reasons: str) -> Problem | None:
-        """The worst of these."""
+        """Return the worst problem with one of these reasons."""
         return next((p for p in self.problems if p.reason in reasons), None)
 
 
@@ -96,11 +96,11 @@ class Finding:
     reason: str
     message: str = ""
     since: float | None = None
-    """Time since when, if that is known otherwise than from the condition's history."""
+    """Time of its last transition, if that does not follow from the condition's history."""
 
 
 def conditions(pool: FiberPool, outlook: Outlook, now: float) -> tuple[PoolCondition, ...]:
-    """All of them; a condition keeps its time while its status stays as it is."""
+    """Return all conditions.  A condition keeps its time while its status is unchanged."""
     before = {condition.type: condition for condition in pool.status.conditions}
     return tuple(
         dated(finding, before.get(finding.type), pool.metadata.generation, now)
@@ -111,7 +111,7 @@ def conditions(pool: FiberPool, outlook: Outlook, now: float) -> tuple[PoolCondi
 def dated(
     finding: Finding, before: PoolCondition | None, generation: int, now: float
 ) -> PoolCondition:
-    """A finding with the time since when it is so."""
+    """Return the condition of a finding, with the time of its last transition."""
     same = before is not None and before.status == finding.status
     since = finding.since
     if since is None and before is not None and same:
@@ -127,7 +127,7 @@ def dated(
 
 
 def phase(pool: FiberPool, found: Sequence[PoolCondition], outlook: Outlook) -> Phase:
-    """The conditions in one word."""
+    """Return the conditions in one word."""
     status = {condition.type: condition.status for condition in found}
     if pool.metadata.deletion_timestamp is not None:
         return Phase.TERMINATING
@@ -172,7 +172,7 @@ def _accepted(outlook: Outlook) -> Finding:
     if problem is not None and problem.severity == "Error":
         return Finding(kind, "False", problem.reason, problem.message)
     if not outlook.judged:
-        message = "the API server has not said yet whether it takes pods of this template"
+        message = "the API server has not accepted a pod of this template yet"
         return Finding(kind, "Unknown", Reason.NOT_JUDGED, message)
     return Finding(kind, "True", Reason.AS_EXPECTED)
 
@@ -203,16 +203,14 @@ def _progressing(pool: FiberPool, outlook: Outlook) -> Finding:
         return Finding(kind, "True", Reason.TERMINATING, "the pool is being deleted")
     if outlook.draining:
         message = (
-            f"workers not wanted any more: {outlook.draining} of {counts.live}; only the master "
-            "knows which are idle, and they go when it names them in spec.scaleDown.release"
+            f"surplus workers: {outlook.draining} of {counts.live}; only the master knows which "
+            "are idle; they are deleted when it names them in spec.scaleDown.release"
         )
         return Finding(kind, "True", Reason.DRAINING, message)
     if outlook.create:
         return Finding(kind, "True", Reason.CREATING, lack)
     if outlook.waits_until is not None:
-        message = (
-            f"{lack}; those that failed are not replaced before {format_time(outlook.waits_until)}"
-        )
+        message = f"{lack}; failed ones are not replaced before {format_time(outlook.waits_until)}"
         return Finding(kind, "True", Reason.BACKING_OFF, message)
     if outlook.replacing:
         message = f"workers of an older template: {outlook.replacing}"
@@ -220,7 +218,7 @@ def _progressing(pool: FiberPool, outlook: Outlook) -> Finding:
     if counts.pending:
         return Finding(kind, "True", Reason.STARTING, f"workers starting: {counts.pending}")
     if counts.joining:
-        message = f"workers that no master has answered yet: {counts.joining}"
+        message = f"workers without an answer from a master yet: {counts.joining}"
         return Finding(kind, "True", Reason.STARTING, message)
     if ending := counts.terminating + outlook.delete:
         return Finding(kind, "True", Reason.DELETING, f"workers ending: {ending}")
@@ -244,7 +242,7 @@ def _master_alive(pool: FiberPool, outlook: Outlook) -> Finding:
         return Finding(kind, "True", Reason.LEASE_RENEWED)
     lost = outlook.problem(Reason.MASTER_LOST)
     message = lost.message if lost else ""
-    # Not the time at which an earlier master was lost: this one has its own grace.
+    # Not the time at which an earlier master was lost: this master has a new grace period.
     return Finding(kind, "False", Reason.MASTER_LOST, message, master_state.lost_since)
 
 
@@ -253,24 +251,24 @@ def _master_unknown(pool: FiberPool, outlook: Outlook) -> Finding:
     if master is None:
         return Finding(kind, "Unknown", Reason.NO_MASTER, "the pool waits for a master")
     if master.lease_name is None:
-        message = "spec.master.leaseName is absent: nobody checks it"
+        message = "spec.master.leaseName is absent: the master is not checked"
         return Finding(kind, "Unknown", Reason.LEASE_NOT_CHECKED, message)
     if outlook.lease_unreadable:
-        message = f"the operator may not read the Lease {master.lease_name}"
+        message = f"the operator lacks the right to read the Lease {master.lease_name}"
         return Finding(kind, "Unknown", Reason.FORBIDDEN, message)
     if problem := outlook.problem(Reason.LEASE_NOT_FOUND):
         return Finding(kind, "Unknown", Reason.LEASE_NOT_FOUND, problem.message)
-    message = f"the Lease {master.lease_name} was not seen to change yet"
+    message = f"the Lease {master.lease_name} has not changed since the operator began to watch it"
     return Finding(kind, "Unknown", Reason.LEASE_NOT_CHECKED, message)
 
 
 def _scaling_limited(pool: FiberPool) -> Finding:
     kind, spec = ConditionType.SCALING_LIMITED, pool.spec
     if spec.replicas > spec.max_replicas:
-        message = f"{spec.replicas} workers are asked for and maxReplicas is {spec.max_replicas}"
+        message = f"replicas is {spec.replicas} and maxReplicas is {spec.max_replicas}"
         return Finding(kind, "True", Reason.ABOVE_MAXIMUM, message)
-    if 0 < spec.replicas < spec.min_replicas:  # nobody who asks for none is told that some are
-        message = f"{spec.replicas} workers are asked for and minReplicas is {spec.min_replicas}"
+    if 0 < spec.replicas < spec.min_replicas:  # replicas 0 is the normal state of a warm pool
+        message = f"replicas is {spec.replicas} and minReplicas is {spec.min_replicas}"
         return Finding(kind, "True", Reason.BELOW_MINIMUM, message)
     return Finding(kind, "False", Reason.WITHIN_BOUNDS)
 
@@ -286,8 +284,9 @@ def _suspended(pool: FiberPool) -> Finding:
 
 
 def describe(facts: Assessment, outlook: Outlook, account: Account) -> FiberPoolStatus:
-    """The status that the pool should have.  ``account`` is that of ``facts``, or what the plan
-    has made of it.
+    """Return the status that the pool should have.
+
+    ``account`` is that of ``facts``, with the plan's changes.
     """
     pool, knowledge = facts.pool, facts.knowledge
     before, counts, master = pool.status, outlook.counts, pool.spec.master
@@ -320,7 +319,7 @@ def describe(facts: Assessment, outlook: Outlook, account: Account) -> FiberPool
 
 
 def _connected(outlook: Outlook) -> int | None:
-    # What a Lease says may be older than the end of a pod, and is the word of a program.
+    # The number in a Lease may be older than the end of a pod, and a program wrote it.
     known = outlook.master_state.connected
     return None if known is None else min(known, outlook.counts.live)
 
@@ -328,7 +327,7 @@ def _connected(outlook: Outlook) -> int | None:
 def patch(pool: FiberPool, status: FiberPoolStatus) -> dict[str, Any] | None:
     """Return the patch of the status, with None for fields to remove; None if nothing changes.
 
-    What could not be read in the old status is not known to be right and is written over.
+    Fields of the old status that could not be read are written over.
     """
     if status == pool.status and not pool.unread:
         return None
@@ -338,22 +337,22 @@ def patch(pool: FiberPool, status: FiberPoolStatus) -> dict[str, Any] | None:
 def describe_unreadable(
     document: Mapping[str, Any], pods: Sequence[PodView], errors: Sequence[str], now: float
 ) -> dict[str, Any] | None:
-    """The status of a pool whose spec cannot be understood: what it was, and what is wrong."""
+    """Return the status of a pool with an invalid spec: the old status and the problem."""
     before, unread = FiberPoolStatus.salvage(document.get("status") or {})
     message = (
         f"The operator cannot read this FiberPool: {'; '.join(errors)}. Correct what is named; "
         "until then nothing is created or deleted."
     )
     generation = whole(mapping(document, "metadata").get("generation"))
-    kept = [c for c in before.conditions if c.type not in _TOLD]
-    told = [
+    kept = [c for c in before.conditions if c.type not in _UNREADABLE]
+    replaced = [
         dated(
             Finding(kind, truth, Reason.INVALID_SPEC, message),
             next((c for c in before.conditions if c.type == kind), None),
             generation,
             now,
         )
-        for kind, truth in _TOLD.items()
+        for kind, truth in _UNREADABLE.items()
     ]
     counts = PodCounts.of(pods, before.desired_replicas or 0, before.template_hash or "")
     known = next((p for p in before.problems if p.reason == Reason.INVALID_SPEC), None)
@@ -373,7 +372,7 @@ def describe_unreadable(
             "pending_replicas": counts.pending,
             "terminating_replicas": counts.terminating,
             "problems": (problem,),
-            "conditions": (*told, *kept),
+            "conditions": (*replaced, *kept),
         }
     )
     if after == before and not unread:
@@ -384,9 +383,9 @@ def describe_unreadable(
 def describe_blind(
     document: Mapping[str, Any], obstacle: Obstacle, now: float
 ) -> dict[str, Any] | None:
-    """The status of a pool whose pods cannot be listed: what it was, and why it says no more.
+    """Return the status of a pool whose pods cannot be listed: the old status and the problem.
 
-    The generation that it was of stays: what changed since is not carried out.
+    ``observedGeneration`` stays, because changes since then are not carried out.
     """
     before, unread = FiberPoolStatus.salvage(document.get("status") or {})
     problem = _lasting(obstacle, before, now)
@@ -398,12 +397,12 @@ def describe_blind(
     if problem.severity == "Error":
         generation = whole(mapping(document, "metadata").get("generation"))
         known = {condition.type: condition for condition in before.conditions}
-        told = [
+        replaced = [
             dated(Finding(kind, truth, problem.reason, problem.message), found, generation, now)
             for kind, truth in _BLIND.items()
             for found in [known.pop(kind, None)]
         ]
-        update["conditions"] = (*told, *known.values())
+        update["conditions"] = (*replaced, *known.values())
         if before.phase not in (Phase.TERMINATING, Phase.SUSPENDED, Phase.FAILED):
             update["phase"] = Phase.DEGRADED
     after = before.model_copy(update=update)
@@ -430,7 +429,7 @@ _BLIND: Mapping[ConditionType, Truth] = {
     ConditionType.DEGRADED: "True",
 }
 
-_TOLD: Mapping[ConditionType, Truth] = {
+_UNREADABLE: Mapping[ConditionType, Truth] = {
     ConditionType.ACCEPTED: "False",
     ConditionType.DEGRADED: "True",
 }
@@ -441,7 +440,7 @@ _TOLD: Mapping[ConditionType, Truth] = {
 
 @dataclass(frozen=True)
 class Change:
-    """From one status to the next, and what is done between."""
+    """Change from one status to the next, and the work between them."""
 
     before: FiberPoolStatus
     after: FiberPoolStatus
@@ -450,10 +449,10 @@ class Change:
     delete: Sequence[Deletion]
 
 
-def events(change: Change, *, told: bool) -> Iterator[PoolEvent]:
-    """Yield events for actions; then, if the new status is ``told``, for the news in it."""
+def events(change: Change, *, status_changes: bool) -> Iterator[PoolEvent]:
+    """Yield events for the work and, if ``status_changes``, for the news in it."""
     yield from _actions(change)
-    if told:
+    if status_changes:
         yield from _disruptions(change)
         yield from _problems(change)
         yield from _masters(change)
@@ -469,15 +468,13 @@ _DELETIONS = {
 
 
 def _actions(change: Change) -> Iterator[PoolEvent]:
-    # Without numbers: a look follows the other, and what is told again raises a count.
+    # Without numbers: a repeated event with equal words only raises a count.
     reasons = {deletion.reason for deletion in change.delete}
     for reason, said in _DELETIONS.items():
         if reason in reasons:
             yield PoolEvent("Normal", reason, said)
     if change.create:
-        yield PoolEvent(
-            "Normal", Reason.SCALED_UP, "Creating workers: more are wanted than are there"
-        )
+        yield PoolEvent("Normal", Reason.SCALED_UP, "Creating workers: more are wanted")
 
 
 def _disruptions(change: Change) -> Iterator[PoolEvent]:
@@ -487,8 +484,8 @@ def _disruptions(change: Change) -> Iterator[PoolEvent]:
     pod = disrupted[-1]
     others = f" and {len(disrupted) - 1} more" if len(disrupted) > 1 else ""
     words = " ".join(filter(None, (pod.reason, pod.message)))
-    message = f"{pod.name}{others} ended through no fault of its own{messages.quoted(words)}"
-    yield PoolEvent("Normal", Reason.DISRUPTED, f"{message}. A new one takes its place at once")
+    message = f"The cluster ended {pod.name}{others}{messages.quoted(words)}"
+    yield PoolEvent("Normal", Reason.DISRUPTED, f"{message}. A new worker replaces it at once")
 
 
 def _problems(change: Change) -> Iterator[PoolEvent]:
@@ -498,7 +495,7 @@ def _problems(change: Change) -> Iterator[PoolEvent]:
         if (problem.reason, problem.severity) not in known or problem.pod in failed:
             yield PoolEvent("Warning", problem.reason, _without_output(problem.message))
     if _was_degraded(change.before) == "True" and _was_degraded(change.after) == "False":
-        yield PoolEvent("Normal", Reason.RECOVERED, "What was wrong with the pool is so no more")
+        yield PoolEvent("Normal", Reason.RECOVERED, "The pool has no problem now")
 
 
 def _masters(change: Change) -> Iterator[PoolEvent]:
@@ -508,15 +505,15 @@ def _masters(change: Change) -> Iterator[PoolEvent]:
     if after.master:
         message = f"Workers dial the master at {after.master}, epoch {after.master_epoch}"
     else:
-        message = "The master has left; the workers wait for the next"
+        message = "The master has left; the workers wait for the next one"
     yield PoolEvent("Normal", Reason.MASTER_CHANGED, message)
 
 
 def _without_output(message: str) -> str:
-    """Less a worker's last lines.
+    """Return ``message`` without a worker's last lines.
 
-    They may hold what others must not read, and events and this operator's log end up where
-    everybody looks; the status and the pod's log are read by whoever may read pools and pods.
+    These may be confidential.  Events and the operator's log have more readers than the status and
+    the pod's log, for which a reader needs the right to read pools and pods.
     """
     return message.partition(messages.LAST_LINES)[0]
 
