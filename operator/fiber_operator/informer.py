@@ -8,7 +8,8 @@
 
 A watch may be behind what this operator did itself.  So the controller tells the informer what to
 expect: a pod that it created is in the cache from then on, and a pod that it deleted counts as
-terminating, whatever the watch still shows.  Kubernetes' own controllers call this expectations.
+terminating, even if the watch shows it otherwise.  Controllers of Kubernetes call this
+expectations.
 
 A watch that breaks off goes on where it was.  Where the API server has forgotten that moment (410
 Gone), the pods are listed again, and the list replaces the cache: a pod that is not in it is gone.

@@ -280,7 +280,7 @@ def kopf_settings() -> kopf.OperatorSettings:
     settings.watching.chunk_size = PAGE
     # Of the Leases of a namespace, and every node has one somewhere, those of masters.
     settings.watching.label_selectors[LEASES] = names.LABEL_POOL_UID
-    # A handler of ours takes no time, and a task for each of a thousand Leases is memory.
+    # The handlers take no time, and a task for each of a thousand Leases would take memory.
     settings.queueing.idle_timeout = 0.05
     settings.queueing.exit_timeout = 0.5
     settings.process.ultimate_exiting_timeout = None
