@@ -11,7 +11,7 @@ def test_is_off_unless_wanted(helm: Helm) -> None:
     assert POLICY not in kinds(helm.render())
 
 
-def test_each_refusal_says_who_why_and_what_to_do(helm: Helm) -> None:
+def test_each_refusal_names_the_user_the_reason_and_the_remedy(helm: Helm) -> None:
     manifests = helm.render({"admissionPolicy": {"create": True}})
     for validation in named(manifests, POLICY)["spec"]["validations"]:
         assert validation["messageExpression"].startswith("variables.who + ")

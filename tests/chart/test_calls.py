@@ -140,13 +140,13 @@ def rights(calls: Iterable[Call], where: Callable[[Call], bool]) -> set[Right]:
     }
 
 
-def test_what_it_may_do_to_pools_is_what_it_does(helm: Helm, calls: list[Call]) -> None:
+def test_the_rights_on_pools_match_the_calls(helm: Helm, calls: list[Call]) -> None:
     role = named(helm.render(), "ClusterRole", f"{OWN}:fiber-fiber-operator")
     places = (OWN, SERVING_NAMESPACE)
     assert rights(calls, lambda call: call.namespace not in places) == set(allowed(role))
 
 
-def test_what_it_may_do_to_its_lease_is_what_it_does(helm: Helm, calls: list[Call]) -> None:
+def test_the_rights_on_the_own_lease_match_the_calls(helm: Helm, calls: list[Call]) -> None:
     role = named(helm.render(), "Role", "fiber-fiber-operator-lease")
     assert rights(calls, lambda call: call.namespace == OWN) == set(allowed(role))
     (names,) = (rule["resourceNames"] for rule in role["rules"] if "resourceNames" in rule)
@@ -154,9 +154,7 @@ def test_what_it_may_do_to_its_lease_is_what_it_does(helm: Helm, calls: list[Cal
     assert {name.replace("fiber-fiber-operator", "fiber-operator") for name in names} == renewed
 
 
-def test_what_it_may_do_to_show_that_it_serves_is_what_it_does(
-    helm: Helm, calls: list[Call]
-) -> None:
+def test_the_rights_on_the_serving_lease_match_the_calls(helm: Helm, calls: list[Call]) -> None:
     role = named(helm.render(), "Role", f"{OWN}:fiber-fiber-operator-serving-lease")
     assert role["metadata"]["namespace"] == SERVING_NAMESPACE
     assert rights(calls, lambda call: call.namespace == SERVING_NAMESPACE) == set(allowed(role))

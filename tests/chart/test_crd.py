@@ -25,7 +25,7 @@ def test_it_is_the_generated_one(helm: Helm, generated: dict[str, Any]) -> None:
     assert rendered["spec"] == generated["spec"]
 
 
-def test_an_upgrade_brings_it_up_to_date_and_nothing_removes_it(helm: Helm) -> None:
+def test_an_upgrade_updates_the_crd_and_an_uninstall_keeps_it(helm: Helm) -> None:
     """Helm leaves alone what is in a folder crds, and removes what has no such policy."""
     rendered = named(helm.render(), "CustomResourceDefinition")
     assert rendered["metadata"]["annotations"]["helm.sh/resource-policy"] == "keep"

@@ -163,7 +163,7 @@ def test_where_pods_run_holds_for_the_test_too(helm: Helm) -> None:
         ([{"operator": "Exists"}], []),
     ],
 )
-def test_it_leaves_a_lost_node_soon_unless_told_otherwise(
+def test_pods_leave_a_lost_node_soon_by_default(
     helm: Helm, tolerations: list[dict[str, Any]], added: list[dict[str, Any]]
 ) -> None:
     spec = pod_spec(helm.render({"tolerations": tolerations}))

@@ -86,7 +86,7 @@ def check(query: str) -> None:
     assert labels(query) <= set().union(*(series[name] for name in found)) | TARGET_LABELS, query
 
 
-def test_panels_ask_for_what_is_exported() -> None:
+def test_panels_query_exported_metrics() -> None:
     for query in queries():
         check(query)
 
@@ -119,7 +119,7 @@ def test_the_config_map_holds_the_dashboard(helm: Helm) -> None:
     assert json.loads(config["data"]["fiber-operator.json"]) == dashboard()
 
 
-def test_alerts_ask_for_what_is_exported(helm: Helm) -> None:
+def test_alerts_query_exported_metrics(helm: Helm) -> None:
     for rule in alerts(helm.render(ON)).values():
         check(rule["expr"])
 
@@ -134,7 +134,7 @@ def test_alerts_look_where_the_service_monitor_puts_the_metrics(helm: Helm) -> N
     assert down == f"absent(fiber_operator_lease_held{{{selector}}} == 1)"
 
 
-def test_alerts_say_what_to_do_and_are_explained(helm: Helm) -> None:
+def test_alerts_name_a_remedy_and_are_explained(helm: Helm) -> None:
     readme = (CHART / "README.md").read_text(encoding="utf-8")
     for name, rule in alerts(helm.render(ON)).items():
         assert "kubectl --namespace" in rule["annotations"]["description"]
@@ -171,14 +171,14 @@ def test_the_service_finds_the_operator_and_not_the_test(helm: Helm) -> None:
     assert not selector <= named(manifests, "Pod")["metadata"]["labels"].items()
 
 
-def test_none_of_it_is_there_unless_asked_for(helm: Helm) -> None:
+def test_monitoring_is_rendered_only_on_request(helm: Helm) -> None:
     usual = kinds(helm.render())
     assert set(usual).isdisjoint({"ServiceMonitor", "PrometheusRule", "ConfigMap"})
     assert "Service" not in kinds(helm.render({"metrics": {"service": {"create": False}}}))
 
 
 @pytest.mark.parametrize("peers", [[], [{"podSelector": {"matchLabels": {"app": "prometheus"}}}]])
-def test_the_network_policy_leaves_only_what_the_operator_needs(
+def test_the_network_policy_allows_only_the_operators_traffic(
     helm: Helm, peers: list[dict[str, Any]]
 ) -> None:
     api = {"cidrs": ["10.0.0.1/32"], "ports": [6443]}

@@ -36,14 +36,14 @@ def test_the_manifest_is_for_a_namespace_that_is_watched(
     assert f"kubectl --namespace {namespace} get fiberpools --watch" in helm.notes(values)
 
 
-def test_the_commands_name_what_is_installed(helm: Helm) -> None:
+def test_the_commands_name_the_installed_objects(helm: Helm) -> None:
     notes = helm.notes()
     name = named(helm.render(), "Deployment")["metadata"]["name"]
     assert f"kubectl --namespace {NAMESPACE} logs deployment/{name}" in notes
     assert f"helm test fiber --namespace {NAMESPACE} --logs" in notes
 
 
-def test_it_says_what_is_watched(helm: Helm) -> None:
+def test_the_notes_name_the_watched_namespaces(helm: Helm) -> None:
     assert helm.notes().startswith("The Fiber operator watches all namespaces.")
     assert "watches the namespaces team-a, team-b, and no other." in helm.notes(TWO)
 
@@ -54,7 +54,7 @@ def test_it_says_whose_rights_are_within_reach(helm: Helm) -> None:
     assert words not in helm.notes(TWO)
 
 
-def test_it_says_what_was_left_to_others(helm: Helm) -> None:
+def test_the_notes_name_the_omitted_parts(helm: Helm) -> None:
     notes = helm.notes({"rbac": {"create": False}, "crds": {"install": False}})
     assert "gives ServiceAccount fiber-fiber-operator the" in notes
     assert "kubectl get crd fiberpools.fiber.dev" in notes

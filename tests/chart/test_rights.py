@@ -18,7 +18,7 @@ def operator(roles: list[Manifest]) -> set[tuple[str, str, str]]:
     return set(allowed(named(roles, "ClusterRole", "fiber-system:fiber-fiber-operator")))
 
 
-def test_no_wildcards_and_nothing_twice(roles: list[Manifest]) -> None:
+def test_roles_have_no_wildcards_and_no_repetitions(roles: list[Manifest]) -> None:
     for role in roles:
         rights = list(allowed(role))
         assert not [right for right in rights if "*" in right]
@@ -36,7 +36,7 @@ def test_the_operator_lists_no_secret(operator: set[tuple[str, str, str]]) -> No
     assert secrets.isdisjoint({"list", "watch"})
 
 
-def test_the_operator_takes_no_rights_and_runs_nothing_in_pods(
+def test_the_operator_cannot_grant_rights_or_run_programs_in_pods(
     operator: set[tuple[str, str, str]],
 ) -> None:
     groups = {group for group, _, _ in operator}
@@ -45,13 +45,13 @@ def test_the_operator_takes_no_rights_and_runs_nothing_in_pods(
     assert resources.isdisjoint({"pods/exec", "pods/portforward", "nodes", "serviceaccounts"})
 
 
-def test_who_looks_on_changes_nothing_and_sees_no_secret(roles: list[Manifest]) -> None:
+def test_a_viewer_changes_no_object_and_reads_no_secret(roles: list[Manifest]) -> None:
     rights = list(allowed(named(roles, "ClusterRole", "fiber-viewer")))
     assert {verb for _, _, verb in rights} == {"get", "list", "watch"}
     assert "secrets" not in {resource for _, resource, _ in rights}
 
 
-def test_a_program_may_do_what_the_sdk_calls_and_nothing_else(roles: list[Manifest]) -> None:
+def test_a_program_has_exactly_the_rights_for_the_sdks_calls(roles: list[Manifest]) -> None:
     rights: dict[str, set[str]] = {}
     for _, resource, verb in allowed(named(roles, "ClusterRole", "fiber-user")):
         rights.setdefault(resource, set()).add(verb)

@@ -115,7 +115,7 @@ def test_it_shows_that_it_serves_where_programs_may_look(
     assert [rule["resourceNames"] for rule in role["rules"]] == [[SERVING_LEASE]]
 
 
-def test_namespaced_makes_nothing_of_the_cluster_but_the_resource_type(helm: Helm) -> None:
+def test_namespaced_makes_no_cluster_object_except_the_resource_type(helm: Helm) -> None:
     assert CLUSTER_WIDE & set(kinds(helm.render(TWO))) == {"CustomResourceDefinition"}
     without = helm.render({**TWO, "crds": {"install": False}})
     assert CLUSTER_WIDE & set(kinds(without)) == set()

@@ -111,7 +111,7 @@ def test_it_says_each_step_once_and_deletes_the_pool() -> None:
     assert pools.pool is None
 
 
-def test_what_an_interrupted_test_left_goes_first() -> None:
+def test_leftovers_of_an_interrupted_test_are_removed_first() -> None:
     pools = Pools(READY)
     pools.pool = {"metadata": {**MANIFEST["metadata"], "uid": "older", "generation": 1}}
     run(pools)
@@ -150,7 +150,7 @@ def test_words_that_change_are_not_repeated() -> None:
     ]
 
 
-def test_an_operator_that_does_nothing_is_named() -> None:
+def test_an_idle_operator_is_named() -> None:
     said = failure(pools := Pools(), patience=0.05)
     assert "did not become ready in 0.05 s" in said
     assert "does not watch the namespace ns" in said

@@ -82,7 +82,7 @@ def test_every_value_is_explained() -> None:
 
 
 @pytest.mark.parametrize("values", [{}, ALL], ids=["defaults", "all"])
-def test_lint_has_nothing_to_say(helm: Helm, values: dict[str, Any]) -> None:
+def test_lint_reports_no_problem(helm: Helm, values: dict[str, Any]) -> None:
     assert "0 chart(s) failed" in helm.lint(values)
 
 
@@ -215,11 +215,11 @@ def test_a_contradiction_is_refused_with_a_sentence(
     ("asked", "limit"),
     [("50m", "0.05"), ("128Mi", "1e9"), (1, 1), ("1k", "1Ki"), (0.5, "500m"), ("1G", "1Gi")],
 )
-def test_a_limit_may_be_what_is_requested_or_more(helm: Helm, asked: Any, limit: Any) -> None:
+def test_a_limit_may_equal_or_exceed_the_request(helm: Helm, asked: Any, limit: Any) -> None:
     helm.render({"resources": {"requests": {"x": asked}, "limits": {"x": limit}}})
 
 
-def test_all_contradictions_are_told_at_once(helm: Helm) -> None:
+def test_all_contradictions_are_reported_at_once(helm: Helm) -> None:
     values = {"namespaces": ["a"], "serviceAccount": {"create": False}}
     with pytest.raises(Refused, match=r"(?s)namespaces is set.*serviceAccount\.create is false"):
         helm.render(values)

@@ -55,7 +55,7 @@ def test_a_module_that_cannot_be_loaded_is_said_at_once() -> None:
         list_cases(target)
 
 
-def test_a_python_without_its_tests_is_told(tmp_path: Path) -> None:
+def test_a_python_without_its_tests_is_reported(tmp_path: Path) -> None:
     # Some distributions put the tests into a separate package.
     (tmp_path / "test").mkdir()
     (tmp_path / "test" / "__init__.py").touch()
@@ -78,7 +78,7 @@ def test_a_listed_test_that_passes_fails_the_run() -> None:
     assert "1 listed but passing" in verdict.closing_line()
 
 
-def test_a_run_of_nothing_fails() -> None:
+def test_an_empty_run_fails() -> None:
     assert not Verdict("t", Report(), {}, 0).ok
 
 
@@ -91,7 +91,7 @@ def test_the_report_gives_each_exclusion_its_reason() -> None:
 
 
 @pytest.mark.parametrize("tiers", [{"core"}, {"core", "prompt", "local"}])
-def test_what_is_left_out_of_the_classes_that_run_has_a_reason(tiers: set[str]) -> None:
+def test_each_excluded_test_of_a_class_that_runs_has_a_reason(tiers: set[str]) -> None:
     groups, left_out = select(Target("multiprocessing", "spawn", frozenset(tiers), 60))
     assert not {id_ for group in groups for id_ in group} & left_out.keys()
     assert all(not line.endswith(": ") for line in left_out.values())

@@ -229,7 +229,7 @@ def test_defaults_are_the_contracts() -> None:
 
 
 @pytest.mark.parametrize(("replicas", "wanted"), [(None, 1), (0, 1), (1, 1), (2, 2), (9, 2)])
-def test_what_is_wanted_lies_between_the_bounds(replicas: int | None, wanted: int) -> None:
+def test_the_wanted_replicas_lie_between_the_bounds(replicas: int | None, wanted: int) -> None:
     change = {"spec.minReplicas": 1, "spec.replicas": replicas}
     assert FiberPool.read(changed(GOOD, change)).wanted == wanted
 

@@ -51,7 +51,7 @@ def test_a_name_that_no_service_could_have_is_refused(pool: str) -> None:
         names.check_pool_name(pool)
 
 
-def test_a_name_that_is_too_long_is_refused_and_told_by_how_much() -> None:
+def test_a_name_that_is_too_long_is_refused_with_its_excess() -> None:
     with pytest.raises(names.InvalidName, match="has 51 characters, more than 50"):
         names.check_pool_name("p" * 51)
 

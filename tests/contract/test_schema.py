@@ -69,7 +69,7 @@ MODELS: dict[str, type[Model]] = {
 }
 
 
-def test_the_files_are_what_the_models_say() -> None:
+def test_the_files_are_generated_from_the_models() -> None:
     assert main(["--check"]) == 0
 
 
@@ -85,7 +85,7 @@ def test_it_is_small_enough_to_be_applied() -> None:
     assert len(manifest().encode()) < MAX_SIZE
 
 
-def test_it_is_what_it_says() -> None:
+def test_the_definition_names_its_group_and_kind() -> None:
     document = yaml.safe_load(manifest())
     assert document == definition()
     spec = document["spec"]
@@ -126,7 +126,7 @@ def test_every_field_can_be_explained() -> None:
         assert " ".join(node["description"].split()) == node["description"], path
 
 
-def test_what_rules_look_at_has_a_limit() -> None:
+def test_fields_that_rules_read_are_bounded() -> None:
     # The API server estimates the highest cost of a rule, and refuses a schema that might be
     # expensive. It refuses absurd values too.
     for path, node in NODES.items():
@@ -203,7 +203,7 @@ def test_no_rule_takes_the_optional_of_a_field() -> None:
 
 
 @pytest.mark.parametrize(("path", "rule"), RULES, ids=RULE_IDS)
-def test_a_rule_names_its_field_and_says_what_to_do(path: str, rule: dict[str, str]) -> None:
+def test_a_rule_names_its_field_and_the_remedy(path: str, rule: dict[str, str]) -> None:
     if "fieldPath" in rule:
         assert f"{path}{rule['fieldPath']}" in NODES
     else:

@@ -20,7 +20,7 @@ MOMENT = 1795272973.0
         ("1970-01-01T00:00:00Z", 0.0),
     ],
 )
-def test_what_kubernetes_writes_can_be_read(text: str, seconds: float) -> None:
+def test_times_of_kubernetes_can_be_read(text: str, seconds: float) -> None:
     assert parse_time(text) == seconds
 
 
@@ -32,7 +32,7 @@ def test_what_kubernetes_writes_can_be_read(text: str, seconds: float) -> None:
         "0001-01-01T00:00:00+01:00",
     ],
 )
-def test_what_is_no_point_in_time_is_refused(text: str) -> None:
+def test_a_text_that_is_no_time_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="is no time such as"):
         parse_time(text)
 
@@ -49,7 +49,7 @@ def test_fractions_are_cut_off() -> None:
     assert format_time(-0.5) == "1969-12-31T23:59:59Z"
 
 
-def test_what_no_calendar_has_is_written_as_the_end_of_it() -> None:
+def test_a_time_beyond_the_calendar_is_written_as_its_end() -> None:
     assert format_time(1e308) == format_time(LATEST) == "9999-12-31T23:59:59Z"
     assert format_time(-1e308) == format_time(EARLIEST) == "0001-01-01T00:00:00Z"
 

@@ -87,7 +87,7 @@ def refusal(scene: Scene, manifest: Body) -> str:
     return ""
 
 
-def test_what_a_template_must_not_ask_for(guarded: Scene, agent: Body) -> None:
+def test_forbidden_template_fields_are_refused(guarded: Scene, agent: Body) -> None:
     pool = Pool(guarded, "es")
     for case, (more, word) in ASKED.items():
         said = refusal(guarded, pool.manifest(with_more(agent, more)))
@@ -101,7 +101,7 @@ def test_what_a_template_must_not_ask_for(guarded: Scene, agent: Body) -> None:
         assert says(said, *words), case
 
 
-def test_what_a_template_may_ask_for(guarded: Scene, agent: Body) -> None:
+def test_allowed_template_fields_pass(guarded: Scene, agent: Body) -> None:
     context = {"runAsNonRoot": True, "capabilities": {"drop": ["ALL"]}, "privileged": False}
     more = {
         "hostNetwork": False,
@@ -149,7 +149,7 @@ def test_a_label_excepts_a_namespace_and_pools_that_are_there_go_on(
         pool.patch(template={"spec": {"hostPID": True}})
 
 
-def test_a_program_is_told_what_the_policy_refuses(
+def test_a_program_gets_the_policys_refusal(
     guarded: Scene, programs: Programs, tmp_path: Path
 ) -> None:
     wishes = tmp_path / "template.json"

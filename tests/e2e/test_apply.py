@@ -104,7 +104,7 @@ def test_kubectl_scales_a_warm_pool_between_its_bounds(pool: Pool, agent: Body) 
     assert pool.scene.most_at_once(is_live) == 3
 
 
-def test_an_attached_master_says_who_goes(pool: Pool, lone_agent: Body) -> None:
+def test_an_attached_master_names_the_workers_to_end(pool: Pool, lone_agent: Body) -> None:
     pool.apply(lone_agent, maxReplicas=5)
     pool.attach(master=SOMEWHERE, replicas=3)
     first, second, third = pool.ready(3)
@@ -121,7 +121,7 @@ def test_an_attached_master_says_who_goes(pool: Pool, lone_agent: Body) -> None:
     assert not pool.status["problems"]
 
 
-def test_a_released_name_that_is_no_worker_is_told(pool: Pool, lone_agent: Body) -> None:
+def test_a_released_name_that_is_no_worker_is_reported(pool: Pool, lone_agent: Body) -> None:
     pool.apply(lone_agent)
     pool.attach(master=SOMEWHERE, replicas=1, scaleDown={"release": ["kube-dns"]})
     problem = pool.has_problem("InvalidRelease", severity="Warning")

@@ -23,7 +23,7 @@ SAME_NAMESPACE: Body = {"podSelector": {}}
 
 
 @pytest.mark.parametrize("place", ["inside", pytest.param("outside", marks=pytest.mark.long)])
-def test_workers_reach_their_program_and_nothing_else(
+def test_workers_reach_only_their_program(
     place: str, programs: Programs, scene: Scene, cluster: Cluster, release: Release
 ) -> None:
     operator = release.pod()

@@ -131,7 +131,9 @@ def after(bare_cluster: None, release: Release, kube: Kube) -> Iterator[None]:
 @pytest.mark.timeout(600, func_only=True)  # `helm test` has a limit of five minutes
 @pytest.mark.usefixtures("after")
 @pytest.mark.parametrize("page", PAGES)
-def test_every_command_does_what_its_page_says(page: str, shell: Shell, cluster: Cluster) -> None:
+def test_every_command_prints_the_output_of_its_page(
+    page: str, shell: Shell, cluster: Cluster
+) -> None:
     if BRING in commands(page) and not isinstance(cluster, Own):
         pytest.skip(f"{cluster.description} is not that of make cluster")
     assert commands(page)[0] == CLUSTER
@@ -140,7 +142,7 @@ def test_every_command_does_what_its_page_says(page: str, shell: Shell, cluster:
         assert re.search(pattern, said[command]), said[command]
 
 
-def test_what_is_left_out_is_shown() -> None:
+def test_skipped_commands_are_shown() -> None:
     assert set(NOT_RUN) < {command for page in SHOWN for command in commands(page)}
 
 

@@ -50,7 +50,7 @@ ERRORS = beginning(r"error .*|3 members .*")
     ],
     ids=["pi", "es", "piped", "adopted", "ppo", "managers", "ring"],
 )
-def test_an_example_gives_what_it_gives_on_one_machine(
+def test_an_example_prints_the_same_as_on_one_machine(
     place: str,
     script: str,
     arguments: tuple[object, ...],
@@ -68,7 +68,7 @@ def test_an_example_gives_what_it_gives_on_one_machine(
 @pytest.mark.long
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.timeout(600, func_only=True)  # the image is built by the first
-def test_a_search_in_an_image_of_its_own(place: str, programs: Programs, cluster: Cluster) -> None:
+def test_a_search_runs_in_a_custom_image(place: str, programs: Programs, cluster: Cluster) -> None:
     programs.image = cluster.bring(images.SEARCH)
     script = "05-search/search.py"
     output = programs.start(place, script, *SEARCH).ends(seconds=120)

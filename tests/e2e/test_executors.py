@@ -15,9 +15,7 @@ pytestmark = pytest.mark.timeout(240, func_only=True)
 
 
 @pytest.mark.parametrize("place", ["outside", pytest.param("inside", marks=pytest.mark.long)])
-def test_an_executor_does_what_it_does_on_one_machine(
-    place: str, programs: Programs, scene: Scene
-) -> None:
+def test_an_executor_works_as_on_one_machine(place: str, programs: Programs, scene: Scene) -> None:
     program = programs.start(place, "executor.py")
     small, large = program.says("options")["hosts"]
     output = program.ends()
@@ -30,7 +28,7 @@ def test_an_executor_does_what_it_does_on_one_machine(
 @pytest.mark.long
 @pytest.mark.timeout(600, func_only=True)  # the image is built by the first
 @pytest.mark.parametrize("place", PLACES)
-def test_libraries_find_what_they_find_alone(
+def test_libraries_find_the_same_as_without_fiber(
     place: str, programs: Programs, cluster: Cluster
 ) -> None:
     programs.image = cluster.bring(images.SEARCH)

@@ -94,7 +94,7 @@ def is_lost(pool: Pool) -> Body:
     return pool.has_problem("MasterLost", seconds=LATE)
 
 
-def test_a_lost_master_is_told(pools: Pools) -> None:
+def test_a_lost_master_is_reported(pools: Pools) -> None:
     pool = pools["retain"]
     problem = is_lost(pool)
     address = names.address_of(SOMEWHERE["host"], SOMEWHERE["port"])

@@ -81,7 +81,7 @@ def test_a_token_that_ends_is_asked_for_again(
 
 
 @pytest.mark.long
-def test_a_program_whose_token_ends_for_good_is_told_so(
+def test_a_program_whose_token_ends_for_good_gets_an_error(
     programs: Programs, scene: Scene, tmp_path: Path
 ) -> None:
     """Programs without a login count as lost later; then the operator removes their pool."""

@@ -68,7 +68,7 @@ def test_environments_whose_pod_is_deleted_are_an_error(
 
 
 @pytest.mark.long
-def test_an_environment_that_needs_too_much_memory_is_told_so(programs: Programs) -> None:
+def test_an_environment_that_needs_too_much_memory_is_named(programs: Programs) -> None:
     program = programs.start("outside", "environments.py", "--accident", "swell")
     sent(program)
     text = program.says("lost", seconds=VERDICT)["text"]
@@ -148,7 +148,7 @@ def test_a_task_that_must_not_run_again_says_whose_pod_went(
 
 @pytest.mark.long
 @pytest.mark.parametrize("place", ["outside", "inside"])
-def test_the_members_of_a_ring_are_told_of_a_pod_that_is_deleted(
+def test_the_members_of_a_ring_get_an_error_if_a_pod_is_deleted(
     place: str, programs: Programs, scene: Scene
 ) -> None:
     program = programs.start(place, "ring.py")

@@ -60,7 +60,7 @@ def test_a_master_outside_of_the_cluster(pool: Pool, agent: Body, host: str) -> 
     assert all(is_ready(pod) for pod in pool.live)
 
 
-def test_a_worker_that_may_write_nothing_but_tmp(pool: Pool, image: str, host: str) -> None:
+def test_a_worker_that_may_write_only_to_tmp_works(pool: Pool, image: str, host: str) -> None:
     pool.apply(template(image, securityContext={"readOnlyRootFilesystem": True}), minReplicas=1)
     (worker,) = pool.ready(1)
     with outside(pool, host) as master:
@@ -133,7 +133,7 @@ def test_workers_end_some_time_after_their_master(pool: Pool, agent: Body, host:
     assert pool.status["problems"] == []  # one that ended well is no failure
 
 
-def test_each_master_gets_the_agents_of_its_own_pool(scene: Scene, agent: Body, host: str) -> None:
+def test_each_master_gets_the_agents_of_its_pool_only(scene: Scene, agent: Body, host: str) -> None:
     es, ppo = Pool(scene, "es"), Pool(scene, "ppo")
     es.apply(agent, minReplicas=1)
     ppo.apply(agent, minReplicas=2)

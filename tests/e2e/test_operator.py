@@ -114,7 +114,7 @@ def test_of_two_operators_one_acts(pool: Pool, agent: Body, release: Release) ->
         release.wait_until_ready()
 
 
-def test_what_somebody_wrote_into_the_status_does_no_harm(pool: Pool, agent: Body) -> None:
+def test_foreign_writes_to_the_status_do_no_harm(pool: Pool, agent: Body) -> None:
     pool.apply(agent, minReplicas=2)
     before = pool.ready(2)
     nonsense = {
@@ -133,7 +133,7 @@ def test_what_somebody_wrote_into_the_status_does_no_harm(pool: Pool, agent: Bod
     assert pool.status["endpoint"].startswith("tls+tcp://")
 
 
-def test_what_monitoring_sees(pool: Pool, agent: Body, release: Release) -> None:
+def test_metrics_reach_the_monitoring(pool: Pool, agent: Body, release: Release) -> None:
     pool.apply(agent, minReplicas=2)
     pool.ready(2)
     mine = {"namespace": pool.scene.namespace, "pool": pool.name}

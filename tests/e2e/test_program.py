@@ -62,9 +62,7 @@ def test_output_has_the_pods_names_in_front(programs: Programs) -> None:
     assert sorted(ran(program)) == list(range(60))
 
 
-def test_the_first_pool_waits_for_pods_and_the_next_for_nothing(
-    programs: Programs, scene: Scene
-) -> None:
+def test_only_the_first_pool_waits_for_pods(programs: Programs, scene: Scene) -> None:
     program = programs.start("outside", "pools.py", 4)
     program.ends(seconds=120)
     # A quick program has ended before Kubernetes calls its first worker Ready.
@@ -102,7 +100,7 @@ def test_two_programs_in_one_namespace(place: str, programs: Programs, scene: Sc
     assert len(ever(scene, "fiberpools")) == 2
 
 
-def test_each_shape_has_pods_of_its_own(programs: Programs, scene: Scene) -> None:
+def test_each_shape_has_separate_pods(programs: Programs, scene: Scene) -> None:
     program = programs.start("outside", "shapes.py")
     program.ends()
     pods = [body for body in ever(scene, "pods").values() if is_worker(body)]

@@ -136,7 +136,7 @@ def node_back_too_late(site: Site) -> Iterator[None]:
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )
-def test_a_map_ends_as_if_nothing_had_been(
+def test_a_map_survives_a_fault_unchanged(
     fault: Fault,
     seconds: float,
     place: str,
@@ -155,7 +155,7 @@ def test_a_map_ends_as_if_nothing_had_been(
 
 
 @pytest.mark.long
-def test_a_program_that_ends_while_nobody_answers_says_what_stays(
+def test_a_program_that_ends_without_an_api_server_names_the_leftovers(
     programs: Programs, cluster: Cluster
 ) -> None:
     program = programs.outside("mapping.py", *RUNNING)
@@ -173,7 +173,7 @@ def test_a_child_that_is_killed_is_replaced_in_its_pod(programs: Programs, scene
     leaves_nothing(program)
 
 
-def test_a_task_that_needs_too_much_memory_is_told_so(programs: Programs) -> None:
+def test_a_task_that_needs_too_much_memory_is_named(programs: Programs) -> None:
     program = programs.start("outside", "mapping.py", "--task", "swell", "--retries", 1)
     output = program.ends(status=1, seconds=90)
     assert all(word in output for word in ("WorkerDied", "OOMKilled", "160Mi")), output
@@ -228,9 +228,7 @@ def node_of(scene: Scene, pod: str) -> str:
 
 @pytest.mark.long
 @pytest.mark.parametrize("place", PLACES)
-def test_a_program_that_is_killed_leaves_nothing_after_its_grace(
-    place: str, programs: Programs
-) -> None:
+def test_a_killed_program_leaves_no_objects_after_its_grace(place: str, programs: Programs) -> None:
     program = programs.start(place, "mapping.py", *RUNNING)
     program.says("first")
     program.kill()

@@ -82,7 +82,7 @@ REFUSED: dict[str, tuple[Callable[[Scene], None], Body, tuple[str, ...], float]]
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_what_cannot_come_is_an_error_at_once(case: str, programs: Programs, scene: Scene) -> None:
+def test_an_impossible_request_fails_at_once(case: str, programs: Programs, scene: Scene) -> None:
     prepare, settings, words, seconds = REFUSED[case]
     prepare(scene)
     program = programs.start("outside", "mapping.py", **settings)
@@ -104,7 +104,7 @@ def test_a_port_that_is_taken(programs: Programs, cluster: Cluster) -> None:
     leaves_nothing(program)
 
 
-def test_without_an_operator_nobody_waits(programs: Programs, release: Release) -> None:
+def test_a_program_without_an_operator_does_not_wait(programs: Programs, release: Release) -> None:
     release.stop()
     try:
         program = programs.start("outside", "mapping.py")
@@ -159,7 +159,7 @@ def test_fiberpools_of_an_older_version(programs: Programs) -> None:
     leaves_nothing(program)
 
 
-def test_a_second_program_is_told_who_holds_a_pool(
+def test_a_second_program_learns_which_program_holds_a_pool(
     programs: Programs, scene: Scene, agent: Body
 ) -> None:
     warm = Pool(scene, "warm").apply(agent, minReplicas=2)

@@ -33,7 +33,7 @@ def test_a_manifest_that_breaks_a_rule_is_refused(kube: Kube, release: object, b
     assert not [word for word in bad.words if word not in caught.value.message]
 
 
-def test_kubectl_says_what_is_wrong(kube: Kube, release: object) -> None:
+def test_kubectl_prints_the_reason_of_a_refusal(kube: Kube, release: object) -> None:
     bad = next(bad for bad in BAD if bad.name == "minimum above maximum")
     with pytest.raises(Failed) as caught:
         kube.apply(bad.manifest())

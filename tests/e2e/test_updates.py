@@ -85,7 +85,7 @@ def test_on_delete_waits_for_somebody(pool: Pool, agent: Body) -> None:
     assert second in pool.names
 
 
-def test_what_is_no_part_of_the_template_restarts_nobody(pool: Pool, agent: Body) -> None:
+def test_a_change_outside_the_template_restarts_no_worker(pool: Pool, agent: Body) -> None:
     pool.apply(agent, minReplicas=1, update={"strategy": "Recreate"})
     before = pool.ready(1)
     pool.apply(agent, minReplicas=2, maxReplicas=9, update={"strategy": "Recreate"})

@@ -63,7 +63,7 @@ def test_a_tiny_run_of_everything(tmp_path: Path, scratch: Path) -> None:
         assert bool(cases) == ("multiprocessing, fork" in page)
 
 
-def test_an_interrupt_leaves_nothing_behind(tmp_path: Path, scratch: Path) -> None:
+def test_an_interrupt_leaves_no_processes_or_files(tmp_path: Path, scratch: Path) -> None:
     only = ["--contenders", "multiprocessing", "--measure", "overhead"]
     with command(tmp_path, scratch, *only) as process:
         assert process.stderr is not None

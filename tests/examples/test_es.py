@@ -39,7 +39,7 @@ def test_the_return_rises(alone: list[str]) -> None:
 
 
 @pytest.mark.parametrize(("backend", "workers"), [("local", 3), ("loopback", 4)])
-def test_who_evaluates_what_makes_no_difference(
+def test_the_result_does_not_depend_on_the_workers(
     alone: list[str], backend: str, workers: int, tmp_path: Path
 ) -> None:
     assert train(backend, workers, tmp_path / "curve.png") == alone

@@ -90,7 +90,7 @@ def test_table_is_read_only(es: Any, temporary: Path) -> None:
         table[0] = 1
 
 
-def test_remove_includes_what_was_left_half_made(es: Any, temporary: Path) -> None:
+def test_remove_includes_incomplete_files(es: Any, temporary: Path) -> None:
     """Remove also the file of a process that was killed while it wrote the table."""
     noise = es("noise")
     (temporary / "fiber-es-noise-test-x1y2z3").touch()

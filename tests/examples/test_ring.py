@@ -32,7 +32,7 @@ def test_members_sum_up_their_gradients(backend: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(importlib.util.find_spec("torch") is None, reason="torch is not installed")
-def test_gloo_sums_up_as_well() -> None:
+def test_gloo_computes_the_sum() -> None:
     done = run("07-ring/regression.py", *SMALL, "--members", 2, "--gloo")
     ours = run("07-ring/regression.py", *SMALL, "--members", 2)
     assert last_error(done.stdout) == pytest.approx(last_error(ours.stdout), rel=1e-3)

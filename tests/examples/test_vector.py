@@ -20,7 +20,7 @@ def train(backend: str, workers: int, picture: Path) -> list[str]:
     return [line for line in done.stdout.splitlines() if " episodes " in line]
 
 
-def test_the_return_rises_whoever_steps(tmp_path: Path) -> None:
+def test_the_return_rises_on_each_vector_environment(tmp_path: Path) -> None:
     lines = train("local", 2, tmp_path / "curve.png")
     returns = [float(line.split()[-1]) for line in lines]
     assert returns[-1] > 1.5 * returns[0]

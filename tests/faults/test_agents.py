@@ -73,7 +73,7 @@ def test_a_killed_agent_ends_its_own_processes_and_no_other(
         assert child.exitcode == -signal.SIGTERM
 
 
-def test_told_to_end_by_sigterm_it_gives_its_processes_time(backend: LoopbackBackend) -> None:
+def test_an_agent_that_gets_sigterm_gives_its_processes_time(backend: LoopbackBackend) -> None:
     ours, theirs = fiber.Pipe()
     child = start(targets.exit_on_sigterm, theirs)
     theirs.close()
@@ -105,7 +105,7 @@ def test_a_stopped_agent_gets_no_new_process_then_is_lost_and_replaced(
     wait_for(lambda: not alive(pid), what="the end of its child")
 
 
-def test_one_that_is_stopped_for_a_moment_loses_nothing(backend: LoopbackBackend) -> None:
+def test_a_brief_stop_of_an_agent_loses_no_message(backend: LoopbackBackend) -> None:
     ours, theirs = fiber.Pipe()
     child = start(targets.echo, theirs)
     theirs.close()

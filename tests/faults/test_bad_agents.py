@@ -137,7 +137,7 @@ def test_wrong_version_of(
     ],
     ids=lambda given: " ".join(given) if isinstance(given, dict) else "",
 )
-def test_an_agent_that_is_told_nonsense(
+def test_an_agent_survives_nonsense(
     master: Callable[..., tuple[Program, Program]], told: dict[str, str], words: str
 ) -> None:
     _, agent = master(**told)

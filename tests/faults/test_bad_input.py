@@ -46,7 +46,7 @@ UNGUARDED_QUEUE_THEN_PROCESS = """
 
 @pytest.mark.parametrize("method", ["forkserver", "spawn"])
 @pytest.mark.parametrize("script", [UNGUARDED_PROCESS, UNGUARDED_QUEUE_THEN_PROCESS])
-def test_an_unguarded_main_is_told_so_and_starts_no_avalanche(
+def test_an_unguarded_main_gets_an_error_and_starts_no_avalanche(
     launch: Callable[..., Program], script: str, method: str
 ) -> None:
     program = launch(script.replace("{method}", method))

@@ -73,7 +73,7 @@ def test_places_of_items_that_were_not_sent_come_back() -> None:
         wait_until(lambda: room_left_by_one(queue) == SIZE - 1, PATIENCE)
 
 
-def test_what_is_refused_by_a_full_queue_keeps_no_pipe_open() -> None:
+def test_an_item_that_a_full_queue_refuses_keeps_no_pipe_open() -> None:
     queue: Any = fiber.Queue(1)
     queue.put("first")
     receiver, sender = fiber.Pipe(duplex=False)

@@ -126,7 +126,7 @@ def test_one_that_closes_all_its_descriptors_is_reported_all_the_same(
     assert ended(child) == 5
 
 
-def test_terminating_one_that_is_gone_is_nothing() -> None:
+def test_terminating_an_ended_child_does_nothing() -> None:
     child = started(targets.nothing)
     child.join(PATIENCE)
     child.terminate()

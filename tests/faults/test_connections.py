@@ -65,7 +65,9 @@ def test_the_end_comes_when_the_holder_closes_a_copy_that_was_pickled_twice(
     assert child.exitcode == 0
 
 
-def test_who_waits_is_woken_by_the_death(pipe: tuple[Any, Any], start: Callable[..., Any]) -> None:
+def test_a_waiting_receiver_is_woken_by_the_death(
+    pipe: tuple[Any, Any], start: Callable[..., Any]
+) -> None:
     ours, theirs = pipe
     child = start(targets.hold, theirs)
     theirs.close()
@@ -94,7 +96,7 @@ def test_it_comes_only_when_the_last_of_many_holders_is_gone(
         ours.recv()
 
 
-def test_what_was_sent_before_the_death_arrives(
+def test_messages_that_were_sent_before_the_death_arrive(
     pipe: tuple[Any, Any], start: Callable[..., Any]
 ) -> None:
     ours, theirs = pipe

@@ -100,7 +100,7 @@ QUEUES = (
 
 
 @pytest.mark.parametrize("what", ["Queue", "SimpleQueue", "JoinableQueue", "Event"])
-def test_too_many_of_anything_leak_nothing(launch: Callable[..., Program], what: str) -> None:
+def test_exceeding_any_limit_leaks_no_descriptor(launch: Callable[..., Program], what: str) -> None:
     output = launch(QUEUES.format(what=what)).finish()
     assert output == "TooManyOpenFiles 100 24\n" * 2 + "True\nTrue\n"
 
@@ -135,7 +135,9 @@ def test_too_many_processes(launch: Callable[..., Program]) -> None:
 
 
 @pytest.mark.parametrize("limit", range(4, 22, 3))
-def test_a_limit_so_low_that_nothing_starts(launch: Callable[..., Program], limit: int) -> None:
+def test_a_limit_below_the_need_of_a_start_is_an_error(
+    launch: Callable[..., Program], limit: int
+) -> None:
     program = launch(PROCESSES.format(limit=limit, atleast=-1))
     program.wait()
     assert "TooManyOpenFiles" in program.rest() + program.stderr
@@ -281,7 +283,7 @@ ANSWER = (
 )
 
 
-def test_an_answer_that_cannot_be_received_is_told(launch: Callable[..., Program]) -> None:
+def test_an_answer_that_cannot_be_received_is_an_error(launch: Callable[..., Program]) -> None:
     assert launch(ANSWER, "apply_async").finish() == "True\n1\n"
 
 

@@ -129,7 +129,7 @@ def host_of_member_0(directory: Path) -> str:
 
 
 @patient
-def test_what_runs_ends_and_nothing_runs_twice(site: Site, tmp_path: Path) -> None:
+def test_running_tasks_end_and_run_only_once(site: Site, tmp_path: Path) -> None:
     with fiber.Pool(2, retries=1, disruptions=0) as pool:
         results = pool.map_async(begin_and_wait, [(tmp_path, n) for n in range(12)])
         wait_for(lambda: len(notes(tmp_path)) >= 2)
@@ -151,7 +151,7 @@ def test_an_agent_leaves_by_name_when_its_last_child_is_gone(site: Site) -> None
     assert agent.leaving.startswith("Drained: ")
 
 
-def test_what_does_not_end_in_time_runs_elsewhere_and_uses_up_no_retry(
+def test_a_task_that_exceeds_the_grace_runs_elsewhere_and_uses_no_retry(
     site: Site, tmp_path: Path
 ) -> None:
     with fiber.Executor(1, retries=0, disruptions=1) as executor:
@@ -203,7 +203,7 @@ def test_twenty_preemptions_in_a_row_are_borne_and_one_more_is_not(
 
 @patient
 @pytest.mark.parametrize(("target", "told"), [(wait_at_sigterm, ["heard", "saved"]), (go_on, [])])
-def test_a_process_hears_sigterm_if_it_is_prepared_and_goes_on_if_not(
+def test_a_process_gets_sigterm_only_if_it_has_a_handler(
     site: Site,
     tmp_path: Path,
     target: Callable[[Path, Any], None],
@@ -241,7 +241,7 @@ def test_new_processes_are_placed_elsewhere(site: Site, tmp_path: Path) -> None:
 
 
 @patient
-def test_a_manager_hears_sigterm_and_goes_on(site: Site, tmp_path: Path) -> None:
+def test_a_manager_gets_sigterm_and_goes_on(site: Site, tmp_path: Path) -> None:
     manager: Any = Tallies()
     manager.start(listen, (tmp_path,))
     with manager:
@@ -261,7 +261,7 @@ def test_a_manager_that_is_killed_at_the_end_of_the_grace_says_why(site: Site) -
 
 
 @patient
-def test_members_of_a_ring_hear_sigterm_and_go_on(site: Site, tmp_path: Path) -> None:
+def test_members_of_a_ring_get_sigterm_and_go_on(site: Site, tmp_path: Path) -> None:
     with ThreadPoolExecutor(1) as threads:
         results = threads.submit(fiber.Ring(2, go_round, begin_member, (tmp_path,)).run)
         site.drain(host_of_member_0(tmp_path))

@@ -86,9 +86,7 @@ def test_a_worker_answers_the_step_that_it_is_at_and_moves(
 
 
 @patient
-def test_workers_that_have_nothing_to_do_move_before_the_next_call(
-    env: VectorEnv, site: Site
-) -> None:
+def test_idle_workers_move_before_the_next_call(env: VectorEnv, site: Site) -> None:
     before = env.call("pid")
     agent = site.drain(host_of(env, 2))
     with pytest.warns(RuntimeWarning, match="environments 2 to 3 replaced: "):
@@ -112,9 +110,7 @@ def test_a_step_that_does_not_end_in_time_ends_its_episodes_and_no_others(
 
 
 @pytest.mark.parametrize("settings", [{"disruptions": 0}])
-def test_a_disruption_too_many_is_an_error_that_tells_both_counts(
-    env: VectorEnv, site: Site
-) -> None:
+def test_too_many_disruptions_are_an_error_with_both_counts(env: VectorEnv, site: Site) -> None:
     env.step_async(UNDER_WAY)
     site.drain(host_of(env, 2))
     with pytest.raises(fiber.WorkerDied, match=REASON) as caught:

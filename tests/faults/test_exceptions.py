@@ -94,7 +94,7 @@ FACES: dict[str, Callable[[], BaseException]] = {
 
 
 @pytest.mark.parametrize("face", FACES)
-def test_its_class_and_attributes_whatever_its_init_takes(backend: str, face: str) -> None:
+def test_an_exception_keeps_its_class_and_attributes_for_each_init(backend: str, face: str) -> None:
     error: Any = FACES[face]()
     assert (error.step, error.loss) == (STEP, 0.5)
     assert str(error) == "loss 0.5 at step 7"

@@ -127,7 +127,7 @@ def ran(folder: Path) -> list[str]:
     return path.read_text().split() if path.exists() else []
 
 
-def test_agents_come_back_to_a_master_that_is_cut_off_and_lose_nothing(
+def test_agents_return_to_a_master_that_was_cut_off_without_loss(
     warm: Warm, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     with running(backend="kubernetes", lost_after=PATIENCE), fiber.Pool(1, pool="warm") as pool:

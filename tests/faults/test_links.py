@@ -18,7 +18,7 @@ SHORT = 0.5
 
 
 @pytest.mark.parametrize("way", ["silence", "sever"])
-def test_a_short_cut_loses_nothing(wire: Wire, way: str) -> None:
+def test_a_short_cut_loses_no_message(wire: Wire, way: str) -> None:
     ours, theirs = fiber.Pipe()
     child = wire.start(targets.echo, theirs)
     theirs.close()
@@ -59,7 +59,9 @@ def test_shared_memory_is_in_step_after_a_short_cut(wire: Wire, way: str) -> Non
 
 @pytest.mark.lost_after(2.0)
 @pytest.mark.parametrize("way", ["silence", "sever"])
-def test_a_long_cut_is_told_ends_its_processes_and_brings_a_new_agent(wire: Wire, way: str) -> None:
+def test_a_long_cut_is_reported_ends_its_processes_and_brings_a_new_agent(
+    wire: Wire, way: str
+) -> None:
     ours, theirs = fiber.Pipe()
     child = wire.start(targets.report_and_block, theirs)
     theirs.close()

@@ -72,7 +72,9 @@ def test_workers_of_a_pool_without_an_idle_timeout_stay() -> None:
 
 @LONG
 @pytest.mark.parametrize("what", ["semaphore", "event", "queue", "pipe"])
-def test_of_what_processes_share(soon: Callable[..., None], what: str, long: float) -> None:
+def test_shared_objects_accept_long_timeouts(
+    soon: Callable[..., None], what: str, long: float
+) -> None:
     if what == "semaphore":
         semaphore = fiber.Semaphore(0)
         soon(semaphore.release)
@@ -145,7 +147,7 @@ BROKEN = """
 """
 
 
-def test_if_the_thread_that_waits_fails_nobody_waits_for_ever(
+def test_a_failure_of_the_waiting_thread_ends_all_waits(
     launch: Callable[..., Program],
 ) -> None:
     program = launch(BROKEN)

@@ -60,7 +60,9 @@ ENDS = (SystemExit, KeyboardInterrupt, GeneratorExit)
 
 
 @pytest.mark.parametrize("kind", ENDS)
-def test_what_would_end_a_thread_is_its_callers_error(kind: type[BaseException]) -> None:
+def test_an_exception_that_would_end_a_thread_is_its_callers_error(
+    kind: type[BaseException],
+) -> None:
     with ModelManager() as manager:
         model = manager.Model()  # type: ignore[attr-defined]
         with pytest.raises(kind, match="no display") as caught:
@@ -95,7 +97,7 @@ def test_a_proxy_that_a_task_alone_had_says_why_it_is_gone() -> None:
 # The manager's process
 
 
-def test_its_death_is_an_error_that_says_who_and_why(manager: Any) -> None:
+def test_the_death_of_a_manager_is_an_error_that_names_it_and_the_reason(manager: Any) -> None:
     shared, name = manager.dict(a=1), manager._process.name
     manager._process.kill()
     manager._process.join(PATIENCE)
@@ -107,7 +109,7 @@ def test_its_death_is_an_error_that_says_who_and_why(manager: Any) -> None:
         len(shared)
 
 
-def test_who_waits_in_a_call_is_told(manager: Any) -> None:
+def test_a_caller_that_waits_gets_the_error(manager: Any) -> None:
     queue, errors = manager.Queue(), []
 
     def wait() -> None:
@@ -126,7 +128,7 @@ def test_who_waits_in_a_call_is_told(manager: Any) -> None:
     assert len(errors) == 3
 
 
-def test_a_process_that_did_not_start_it_is_told_too(manager: Any) -> None:
+def test_a_process_that_did_not_start_it_gets_the_error_too(manager: Any) -> None:
     ours, theirs = fiber.Pipe()
     child = fiber.Process(target=targets.touch_until_it_fails, args=(manager.list(), theirs))
     child.start()
@@ -145,7 +147,7 @@ def test_a_process_that_did_not_start_it_is_told_too(manager: Any) -> None:
 # A client
 
 
-def test_what_only_a_dead_process_referred_to_goes(manager: Any, victim: Any) -> None:
+def test_an_object_with_only_dead_users_is_released(manager: Any, victim: Any) -> None:
     made = manager.Queue()
     objects = manager._number_of_objects()
     victim("make", manager.address, made)
@@ -236,7 +238,7 @@ def test_a_proxy_outlives_the_process_that_made_its_object(manager: Any, victim:
     assert list(made) == ["made", "more"]
 
 
-def test_a_stopped_manager_holds_nobody_up_that_lets_go(manager: Any) -> None:
+def test_a_stopped_manager_does_not_delay_the_release_of_proxies(manager: Any) -> None:
     proxies = [manager.list() for _ in range(3)]
     os.kill(manager._process.pid, signal.SIGSTOP)
     try:

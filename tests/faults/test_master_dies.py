@@ -36,7 +36,7 @@ IDLE_AND_BUSY = """
     ("signum", "method"),
     [(signal.SIGKILL, "forkserver"), (signal.SIGSEGV, "spawn"), (signal.SIGTERM, "forkserver")],
 )
-def test_killed_it_leaves_nothing(
+def test_a_killed_program_leaves_no_process(
     launch_on: Callable[..., Program], method: str, signum: signal.Signals
 ) -> None:
     program = launch_on(IDLE_AND_BUSY.format(method=method))
@@ -92,7 +92,7 @@ def test_a_nested_parent_that_is_killed_takes_its_descendants_and_only_them(
 
 
 @pytest.mark.parametrize("spared", ["zygote|fiber.agent", "zygote", "fiber.agent", None])
-def test_killed_while_others_of_it_are_stopped_it_leaves_nothing(
+def test_a_program_killed_while_its_children_are_stopped_leaves_no_process(
     launch_on: Callable[..., Program], spared: str | None
 ) -> None:
     program = launch_on(IDLE_AND_BUSY.format(method="forkserver"))
@@ -117,7 +117,7 @@ def adopting() -> Iterator[list[int]]:
             os.waitpid(pid, 0)
 
 
-def test_killed_while_all_of_it_is_stopped_it_leaves_nothing_to_a_supervisor(
+def test_a_program_killed_while_it_is_stopped_leaves_no_process_to_a_supervisor(
     adopting: list[int], launch_on: Callable[..., Program]
 ) -> None:
     # The kernel lets no group go on that has a parent in its session, as here.
@@ -164,7 +164,7 @@ POOL_AND_QUEUE = """
 """
 
 
-def test_killed_with_pool_queue_and_pipes_it_leaves_nothing(
+def test_a_program_killed_with_pool_queue_and_pipes_leaves_no_process(
     launch_on: Callable[..., Program],
 ) -> None:
     program = launch_on(POOL_AND_QUEUE)
@@ -210,7 +210,7 @@ STARTING_WORKER = """
 """
 
 
-def test_a_worker_that_is_ready_when_nobody_is_there_says_nothing(
+def test_a_worker_that_becomes_ready_without_a_master_writes_no_error(
     launch: Callable[..., Program],
 ) -> None:
     program = launch(STARTING_WORKER)

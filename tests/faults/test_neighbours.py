@@ -132,7 +132,7 @@ SUBPROCESS = """
 """
 
 
-def test_subprocesses_of_both_sides_are_reaped_by_whoever_started_them(
+def test_subprocesses_of_both_sides_are_reaped_by_their_parents(
     launch: Callable[..., Program],
 ) -> None:
     assert launch(SUBPROCESS).finish() == "(3, 'inside\\n')\n0\n"
@@ -158,7 +158,7 @@ ORPHANS = """
 """
 
 
-def test_children_that_fork_and_forget_disturb_nobody(launch_on: Callable[..., Program]) -> None:
+def test_orphans_of_children_disturb_no_process(launch_on: Callable[..., Program]) -> None:
     assert launch_on(ORPHANS).finish() == "0\n0\n0\n"
 
 

@@ -59,7 +59,7 @@ def test_with_error_handling_a_deterministic_exception_respawns_for_ever(tmp_pat
         assert len(list(tmp_path.iterdir())) == 3
 
 
-def test_a_crash_in_a_chunk_returns_none_silently(pool: Pool) -> None:
+def test_a_crash_in_a_chunk_is_never_a_silent_none(pool: Pool) -> None:
     with pytest.raises(WorkerDied, match="die_if"):
         pool.starmap_async(tasks.die_if, [(n, 5) for n in range(10)], chunksize=10).get(PATIENCE)
 

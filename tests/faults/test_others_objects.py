@@ -52,7 +52,7 @@ def break_in(mine: Any) -> tuple[int, list[bytes]]:
     return refused, found
 
 
-def test_the_address_of_a_hub_opens_nothing_that_others_have() -> None:
+def test_the_address_of_a_hub_gives_no_access_to_others_objects() -> None:
     secret: Any = fiber.Queue()
     seen: Any = fiber.Queue()
     mine: Any = fiber.Queue()
@@ -81,7 +81,7 @@ def hand_on(depth: int, by: Any, of: Any) -> Any:
 
 
 @pytest.mark.parametrize("depth", [0, 1, 2])
-def test_what_was_handed_may_be_handed_on(depth: int) -> None:
+def test_a_received_object_may_be_passed_on(depth: int) -> None:
     inner: Any = fiber.Queue()
     outer: Any = fiber.Queue()
     with fiber.Manager() as manager, fiber.Pool(1) as pool:

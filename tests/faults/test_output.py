@@ -28,7 +28,7 @@ UNCAUGHT = """
     ("way", "words"),
     [("raise", ["Process unlucky:", "ValueError: on purpose"]), ("sys.exit text", ["a last word"])],
 )
-def test_what_it_failed_with_is_on_stderr(
+def test_the_error_of_a_child_is_on_stderr(
     launch_on: Callable[..., Program], way: str, words: list[str]
 ) -> None:
     program = launch_on(UNCAUGHT, way)
@@ -55,7 +55,7 @@ NOISY = """
 
 
 @pytest.mark.parametrize("full", [{"stdout"}, {"stderr"}, {"stdout", "stderr"}])
-def test_a_full_disk_under_the_output_costs_the_lines_and_nothing_more(
+def test_a_full_disk_under_the_output_only_loses_the_lines(
     launch_on: Callable[..., Program], full: set[str], request: pytest.FixtureRequest
 ) -> None:
     with open("/dev/full", "wb") as device:
@@ -125,7 +125,7 @@ def test_a_program_that_closes_its_standard_streams_itself(
     assert program.left() == []
 
 
-def test_in_development_mode_nothing_of_ours_is_warned_of(
+def test_development_mode_warns_of_no_fault_of_fiber(
     launch_on: Callable[..., Program],
 ) -> None:
     program = launch_on(
@@ -190,7 +190,7 @@ PARTS = """
 """
 
 
-def test_a_line_without_an_end_arrives_when_its_process_ends(
+def test_an_incomplete_line_arrives_when_its_process_ends(
     launch: Callable[..., Program],
 ) -> None:
     assert launch(PARTS).finish() == "0 1 2 "
@@ -217,7 +217,7 @@ def test_much_output_arrives_whole_and_in_order(launch: Callable[..., Program]) 
     assert [int(line.split()[-1]) for line in lines] == list(range(20_000))
 
 
-def test_an_output_pipe_that_nobody_reads_any_more(launch_on: Callable[..., Program]) -> None:
+def test_an_output_pipe_without_a_reader_harms_no_task(launch_on: Callable[..., Program]) -> None:
     reader, writer = os.pipe()
     program = launch_on(NOISY, stdout=writer)
     os.close(writer)

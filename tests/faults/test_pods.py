@@ -173,7 +173,7 @@ def test_gymnasium_has_its_observations_in_memory_that_pods_share(cluster: FakeC
             assert np.array_equal(here.step(actions)[0], there.step(actions)[0])
 
 
-def test_what_a_killed_process_of_a_pod_held_is_released(cluster: FakeCluster) -> None:
+def test_a_killed_process_of_a_pod_releases_its_locks(cluster: FakeCluster) -> None:
     with running(backend="kubernetes"):
         lock = fiber.Lock()
         process = fiber.Process(target=acquire_and_die, args=(lock,))
@@ -184,7 +184,7 @@ def test_what_a_killed_process_of_a_pod_held_is_released(cluster: FakeCluster) -
         assert process.name in acquired.holder
 
 
-def test_a_barrier_of_which_a_pod_is_deleted_is_broken(cluster: FakeCluster) -> None:
+def test_a_barrier_is_broken_if_a_pod_of_its_parties_is_deleted(cluster: FakeCluster) -> None:
     with running(backend="kubernetes"):
         barrier = fiber.Barrier(2)
         process = fiber.Process(target=wait_twice, args=(barrier,))
@@ -209,7 +209,7 @@ def test_the_next_pool_begins_on_pods_that_are_there(cluster: FakeCluster) -> No
         assert len(cluster.objects("fiberpools")) == 1
 
 
-def test_pods_that_nothing_runs_on_are_released_by_name(cluster: FakeCluster) -> None:
+def test_idle_pods_are_released_by_name(cluster: FakeCluster) -> None:
     with running(backend="kubernetes", idle_timeout=0.2):
         with fiber.Pool(2) as pool:
             pool.map(square, range(10))
@@ -220,7 +220,7 @@ def test_pods_that_nothing_runs_on_are_released_by_name(cluster: FakeCluster) ->
             assert pool.apply(square, (3,)) == 9
 
 
-def test_functions_that_wish_for_more_run_in_pods_of_their_own(cluster: FakeCluster) -> None:
+def test_functions_with_greater_needs_run_in_other_pods(cluster: FakeCluster) -> None:
     with running(backend="kubernetes"):
         large = fiber.meta(cpu=0.5, memory=64)(square)
         with fiber.Pool(1) as pool, fiber.Pool(1) as other:
@@ -268,7 +268,7 @@ def stay_in_ring(channel: Any, rank: int, size: int) -> None:
             channel.send(pod)
 
 
-def test_a_rings_members_are_in_pods_and_hear_of_one_that_is_lost(cluster: FakeCluster) -> None:
+def test_a_rings_members_are_in_pods_and_get_an_error_if_one_is_lost(cluster: FakeCluster) -> None:
     with running(backend="kubernetes"):
         ring = fiber.Ring(2, lambda rank, size: fiber.ring.current().exchange(own_pod()))
         assert sorted(ring.run()) == pods_of(cluster)
@@ -344,7 +344,7 @@ def test_a_deleted_pod_costs_its_tasks_another_run(cluster: FakeCluster) -> None
         assert result.get(PATIENCE) == [n * n for n in range(200)]
 
 
-def test_what_workers_print_comes_with_their_pods_names(
+def test_the_output_of_workers_has_their_pods_names(
     cluster: FakeCluster, capfd: pytest.CaptureFixture[str]
 ) -> None:
     with running(backend="kubernetes"), fiber.Pool(1) as pool:
@@ -457,7 +457,7 @@ def test_an_outdated_pod_of_somebody_elses_is_replaced_when_it_is_idle(
     cluster.do(cluster.world.store.delete, "fiberpools", "lab", "warm")
 
 
-def test_the_end_of_a_pipe_says_what_became_of_the_pod(cluster: FakeCluster) -> None:
+def test_the_end_of_a_pipe_names_the_end_of_the_pod(cluster: FakeCluster) -> None:
     with running(backend="kubernetes"):
         ours, theirs = fiber.Pipe()
         child = fiber.Process(target=send_and_wait, args=(theirs, "ready"))
@@ -492,7 +492,7 @@ def test_pools_of_all_shapes_end_at_the_same_time(
     assert sorted(met) == [0, 1, 2]
 
 
-def test_while_the_api_server_does_not_answer_that_is_what_is_said(
+def test_an_api_server_without_answers_is_reported(
     cluster: FakeCluster, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("fiber._backends.kubernetes.waiting._FIRST_WRITTEN", 0.1)

@@ -138,7 +138,7 @@ def test_callbacks_come_once_however_workers_die() -> None:
     assert set(calls.values()) == {1}
 
 
-def test_without_retries_nothing_runs_twice_and_nothing_is_forgotten(tmp_path: Path) -> None:
+def test_without_retries_each_task_runs_at_most_once_and_gets_a_result(tmp_path: Path) -> None:
     work = functools.partial(tasks.note_and_return, str(tmp_path))
     with fiber.Pool(2, retries=0) as pool:
         works(pool)

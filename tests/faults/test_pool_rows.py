@@ -68,7 +68,7 @@ def test_every_kind_of_call_raises_it(pool: Pool) -> None:
         (tasks.raise_unpicklable, MaybeEncodingError, "does not unpickle"),
     ],
 )
-def test_what_does_not_travel_back_is_an_error_that_shows_it(
+def test_a_result_that_cannot_be_pickled_is_an_error_that_shows_it(
     pool: Pool, function: Any, error: type[Exception], words: str
 ) -> None:
     with pytest.raises(error, match=words):
@@ -78,7 +78,7 @@ def test_what_does_not_travel_back_is_an_error_that_shows_it(
     works(pool)
 
 
-def test_what_does_not_travel_there_is_an_error_at_once(pool: Pool) -> None:
+def test_an_argument_that_cannot_be_pickled_is_an_error_at_once(pool: Pool) -> None:
     lock: Any = threading.Lock()
     calls: list[Callable[[], Any]] = [
         lambda: pool.apply(abs, (lock,)),
@@ -149,7 +149,7 @@ def test_sys_exit_is_an_exception_of_the_task(pool: Pool) -> None:
 # Workers that never come to be
 
 
-def test_an_initializer_that_raises_is_told_to_the_caller() -> None:
+def test_an_initializer_that_raises_is_the_callers_error() -> None:
     pool = fiber.Pool(2, initializer=tasks.fail_to_initialize)
     with pytest.raises(StartError, match="the data set is not there"):
         pool.apply(abs, (-1,))
@@ -159,7 +159,7 @@ def test_an_initializer_that_raises_is_told_to_the_caller() -> None:
     pool.join()
 
 
-def test_workers_that_die_at_birth_are_told_too() -> None:
+def test_workers_that_die_at_their_start_are_reported() -> None:
     pool = fiber.Pool(2, initializer=tasks.die)
     with pytest.raises(StartError, match="SIGKILL"):
         pool.apply(abs, (-1,))
@@ -208,7 +208,7 @@ def test_terminate_is_prompt_with_much_queued_and_workers_blocked(tmp_path: Path
     del lazy
 
 
-def test_close_and_join_finish_what_was_asked(tmp_path: Path) -> None:
+def test_close_and_join_finish_the_submitted_tasks(tmp_path: Path) -> None:
     pool = fiber.Pool(2)
     work = functools.partial(tasks.note_and_return, str(tmp_path))
     result = pool.map_async(work, range(50), chunksize=1)

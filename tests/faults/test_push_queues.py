@@ -64,9 +64,7 @@ def test_each_gets_the_next(queue: SimpleQueuePush[Any], readers: list[Reader]) 
         assert reader.ask("empty") is True
 
 
-def test_what_is_dealt_is_not_waited_for(
-    queue: SimpleQueuePush[Any], readers: list[Reader]
-) -> None:
+def test_a_dealt_item_is_not_waited_for(queue: SimpleQueuePush[Any], readers: list[Reader]) -> None:
     large = bytes(2_000_000)
     queue.put(large)
     queue.put("small")
@@ -97,7 +95,7 @@ def test_the_others_go_on_without_a_dead_one(
     assert len(got) == len(set(got))
 
 
-def test_one_that_reads_nothing_is_passed_over(
+def test_a_reader_that_does_not_read_is_skipped(
     queue: SimpleQueuePush[Any], readers: list[Reader]
 ) -> None:
     idle, *_ = readers
@@ -109,7 +107,7 @@ def test_one_that_reads_nothing_is_passed_over(
                 assert reader.ask("get") == item
 
 
-def test_who_made_it_can_read_too_and_a_thread_is_no_second_reader(
+def test_the_maker_can_read_too_and_a_thread_is_no_second_reader(
     queue: SimpleQueuePush[Any],
 ) -> None:
     for item in range(4):

@@ -30,7 +30,7 @@ SCRIPT = """
 @pytest.mark.parametrize(
     ("mode", "backend"), [*((mode, "local") for mode in MODES), ("all", "loopback")]
 )
-def test_calls_survive_what_strikes_at_random(
+def test_calls_survive_random_interrupts(
     launch: Callable[..., Program], mode: str, backend: str
 ) -> None:
     seed = SEED or str(random.randrange(10**6))

@@ -20,7 +20,7 @@ PROGRAM = """
 """
 
 
-def test_a_program_that_is_killed_leaves_nothing(launch: Callable[..., Program]) -> None:
+def test_a_killed_program_leaves_no_member(launch: Callable[..., Program]) -> None:
     program = launch(PROGRAM)
     assert program.line() == "ready"
     program.kill()

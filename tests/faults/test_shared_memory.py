@@ -39,7 +39,7 @@ def kill(agents: LoopbackBackend) -> None:
     os.kill(pid, signal.SIGKILL)
 
 
-def test_a_writer_that_is_killed_leaves_what_it_had_written(backend: str) -> None:
+def test_writes_of_a_killed_process_stay(backend: str) -> None:
     array = fiber.RawArray("i", 4)
     child = start(targets.write_half_and_die, array)
     child.join(PATIENCE)
@@ -47,7 +47,7 @@ def test_a_writer_that_is_killed_leaves_what_it_had_written(backend: str) -> Non
     assert list(array) == [1, 2, 0, 0]
 
 
-def test_a_manager_of_memory_on_another_host_says_what_to_use(agents: LoopbackBackend) -> None:
+def test_a_manager_of_memory_on_another_host_names_the_replacement(agents: LoopbackBackend) -> None:
     with (
         SharedMemoryManager() as manager,
         pytest.raises(RuntimeError, match=r"host 'loopback-0' .*fiber\.RawArray"),

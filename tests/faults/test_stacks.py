@@ -39,7 +39,7 @@ def test_a_worker_that_crashes_says_where_it_was(signum: signal.Signals) -> None
     assert " in crash" in str(error)
 
 
-def test_an_environment_that_nothing_stops_says_where_it_was(
+def test_an_environment_that_hangs_reports_its_stack(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(worker_process, "GRACE", 0.3)
@@ -52,7 +52,7 @@ def test_an_environment_that_nothing_stops_says_where_it_was(
     assert "slot.py" not in str(caught.value)
 
 
-def test_of_a_worker_that_is_killed_nothing_is_known() -> None:
+def test_a_killed_worker_reports_no_stack() -> None:
     with fiber.Pool(1, retries=0) as pool, pytest.raises(WorkerDied) as caught:
         pool.apply(tasks.die)
     assert caught.value.stack == ""

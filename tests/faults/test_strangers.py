@@ -81,7 +81,7 @@ def test_garbage_on_the_masters_port(backend: LoopbackBackend, data: bytes) -> N
     works()
 
 
-def test_strangers_that_say_nothing_and_stay_hold_nobody_up(backend: LoopbackBackend) -> None:
+def test_silent_strangers_delay_no_agent(backend: LoopbackBackend) -> None:
     strangers = [socket.create_connection(address(backend), PATIENCE) for _ in range(50)]
     works()
     backend._slots[0].process.kill()
@@ -157,7 +157,7 @@ def test_nonsense_over_tls_is_not_unpickled(
     assert not trace.exists()
 
 
-def test_a_stranger_who_claims_to_be_an_agent_is_not_believed(backend: LoopbackBackend) -> None:
+def test_a_stranger_that_claims_to_be_an_agent_is_refused(backend: LoopbackBackend) -> None:
     slot = backend._slots[0]
     hello = AgentHello(Identity.of_this_process(slot.name, slot.uid), "0" * 32, 0, False)
     forged = replace(make_credentials().agent(slot.name, slot.uid), master="")
@@ -178,7 +178,7 @@ def door() -> Iterator[str]:
         yield runtime.hub.address.path
 
 
-def test_the_door_is_in_a_directory_that_only_this_user_can_enter(door: str) -> None:
+def test_the_hubs_socket_is_in_a_directory_that_only_this_user_can_enter(door: str) -> None:
     assert os.stat(os.path.dirname(door)).st_mode & 0o077 == 0
 
 
@@ -197,7 +197,7 @@ except OSError as error:
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
-def test_another_user_is_not_heard_at_the_door(door: str) -> None:
+def test_another_user_cannot_connect_to_the_hubs_socket(door: str) -> None:
     def knock() -> str:
         # Isolated, and without site: the other user may not read this one's packages.
         command = [sys.executable, "-I", "-S", "-c", KNOCK, door]
@@ -222,7 +222,7 @@ def test_named_shared_memory_is_this_users_alone() -> None:
 
 
 @pytest.mark.parametrize("data", [data for data in GARBAGE if data], ids=range(len(GARBAGE) - 1))
-def test_garbage_at_the_door(door: str, data: bytes) -> None:
+def test_garbage_at_the_hubs_socket_harms_no_process(door: str, data: bytes) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as stranger:
         stranger.settimeout(PATIENCE)
         stranger.connect(door)
@@ -235,7 +235,7 @@ def test_garbage_at_the_door(door: str, data: bytes) -> None:
     works()
 
 
-def test_nothing_that_a_stranger_sends_is_unpickled(door: str, tmp_path: Path) -> None:
+def test_bytes_of_a_stranger_are_never_unpickled(door: str, tmp_path: Path) -> None:
     trace = tmp_path / "unpickled"
     payload = pickle.dumps(Bomb(trace))
     for prefix in (b"", b"\x00", b"\x01", b"\x02"):
@@ -251,7 +251,7 @@ def test_nothing_that_a_stranger_sends_is_unpickled(door: str, tmp_path: Path) -
     assert not trace.exists()
 
 
-def test_many_who_knock_and_wait_hold_nobody_up(door: str) -> None:
+def test_many_silent_connections_delay_no_agent(door: str) -> None:
     strangers = []
     for _ in range(64):
         stranger = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)

@@ -114,7 +114,7 @@ def test_a_runtime_directory_that_is_none_is_named(
     assert "ConfigError" in program.stderr
 
 
-def test_a_path_too_long_for_a_socket_says_what_to_set(
+def test_a_path_too_long_for_a_socket_names_the_setting(
     launch_on: Callable[..., Program], folder: Path
 ) -> None:
     deep = folder / ("d" * 100)

@@ -151,7 +151,7 @@ def test_everything_works(
         assert len(re.findall(told, program.stderr)) == 1, program.stderr
 
 
-def test_libraries_that_end_their_threads_before_a_fork_cost_nothing(
+def test_libraries_that_end_their_threads_before_a_fork_need_no_second_zygote(
     launch: Callable[..., Program],
 ) -> None:
     program = launch("""

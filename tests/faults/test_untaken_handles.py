@@ -24,7 +24,7 @@ UNTAKEN = """
 
 
 @pytest.mark.parametrize("library", ["multiprocessing", "fiber"])
-def test_a_handle_that_nobody_took_holds_its_end_as_long_as_multiprocessings(
+def test_an_untaken_handle_holds_its_end_as_long_as_multiprocessings(
     launch_on: Callable[..., Program], library: str
 ) -> None:
     """Kernels throw a message away together with its pipe, and notify no process.

@@ -139,7 +139,9 @@ def test_one_that_hangs_is_made_anew(vector_env: Make) -> None:
     works(env)
 
 
-def test_a_worker_that_nothing_stops(vector_env: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_worker_that_ignores_signals_is_killed(
+    vector_env: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(worker_process, "GRACE", 0.3)
     env = vector_env(timeout=1.5)
     with pytest.raises(fiber.TimeoutError, match=r"so worker '.*-0' was killed"):
@@ -171,7 +173,7 @@ def test_a_failure_between_those_that_are_ready(vector_env: Make) -> None:
     works(env)
 
 
-def test_a_worker_that_is_killed_while_nothing_is_asked(vector_env: Make) -> None:
+def test_a_worker_that_is_killed_while_idle_is_replaced(vector_env: Make) -> None:
     env = vector_env(on_error="restart")
     pid = env.call("pid")[0]
     os.kill(pid, signal.SIGKILL)
@@ -302,7 +304,7 @@ def test_an_interrupt(
     assert not program.stderr
 
 
-def test_a_learner_that_is_killed_leaves_nothing(launch_on: Callable[..., Program]) -> None:
+def test_a_killed_learner_leaves_no_process(launch_on: Callable[..., Program]) -> None:
     program = launch_on(
         PROGRAM.format(prepare="pass", call="env.step([Faulty.HANG] * 3)", close="pass")
     )

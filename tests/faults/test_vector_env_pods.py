@@ -37,7 +37,7 @@ def quick() -> Faulty:
     return Faulty()
 
 
-def test_a_worker_has_what_its_environments_need(cluster: FakeCluster) -> None:
+def test_a_pod_worker_has_the_resources_of_its_environments(cluster: FakeCluster) -> None:
     env = VectorEnv([small, quick], num_workers=1)
     try:
         (pod,) = cluster.objects("pods")

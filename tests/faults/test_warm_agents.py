@@ -117,7 +117,7 @@ def test_it_waits_for_its_first_master_for_longer_than_agents_of_a_run(pool: Poo
     assert pool.master().line() == "joined warm-0"
 
 
-def test_it_serves_one_master_after_the_other_and_keeps_nothing_of_them(pool: Pool) -> None:
+def test_an_agent_serves_one_master_after_the_other_and_keeps_no_state(pool: Pool) -> None:
     agent = pool.agent(grace=30)
     descriptors = []
     for _ in range(3):
@@ -143,7 +143,7 @@ raise ImportError(__name__)
 
 
 @pytest.mark.parametrize("module", ["sitecustomize", "socket", "fiber", "msvcrt"])
-def test_modules_that_a_task_wrote_do_not_run_in_the_next_life(
+def test_modules_that_a_task_wrote_do_not_run_for_the_next_master(
     pool: Pool, tmp_path: Path, module: str
 ) -> None:
     """Write into the working directory, which Python searches first, and on PYTHONPATH."""
@@ -161,7 +161,7 @@ def test_modules_that_a_task_wrote_do_not_run_in_the_next_life(
     assert [place for place in places if Path(f"{place}.ran").exists()] == []
 
 
-def test_children_of_the_next_life_have_the_flags_of_the_first() -> None:
+def test_children_of_the_next_master_have_the_first_ones_flags() -> None:
     program = """
 import subprocess, sys
 from fiber._agent import main, zygote_process
@@ -198,7 +198,7 @@ def test_it_serves_where_the_kernel_does_not_hide_it_and_says_so(pool: Pool) -> 
     assert "fiber agent warm-0: the kernel refused prctl(PR_SET_DUMPABLE)" in agent.stderr
 
 
-def test_it_serves_no_second_master_where_it_cannot_find_what_tasks_left(pool: Pool) -> None:
+def test_an_agent_that_cannot_find_the_tasks_files_serves_no_second_master(pool: Pool) -> None:
     refused = """
     from fiber._agent import child
     child.become_subreaper = lambda: False
@@ -254,7 +254,7 @@ def test_a_longer_grace_of_the_master_holds_too(pool: Pool) -> None:
     assert pool.master().line() == "joined warm-0"
 
 
-def test_a_master_that_said_goodbye_is_not_lost(pool: Pool) -> None:
+def test_a_master_that_ended_in_order_is_not_lost(pool: Pool) -> None:
     agent = pool.agent(grace=0.5)
     master = pool.master()
     assert master.line() == "joined warm-0"
@@ -322,7 +322,7 @@ def test_in_the_image_a_signal_waits_for_python_itself() -> None:
     assert ran.stdout == "True\n", ran.stderr
 
 
-def test_elsewhere_it_waits_for_what_takes_long_to_import() -> None:
+def test_the_agent_waits_for_slow_imports_elsewhere() -> None:
     program = f"""
 import runpy, sys, types
 sys.argv = ["agent"]

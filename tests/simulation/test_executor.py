@@ -24,7 +24,7 @@ def test_it_keeps_them_over_real_links_to_real_agent_services(part: int) -> None
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_what_a_leased_worker_answers_before_it_dies_counts(seed: int) -> None:
+def test_answers_of_a_leased_worker_that_dies_count(seed: int) -> None:
     """Recall a call before its caller has looked; then it must not run again."""
     job = Job(0.0, (Task(1e-4),) * 12, bite=3000, pause=0.0, retries=1)
     for at in range(5, 25):

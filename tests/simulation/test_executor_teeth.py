@@ -27,9 +27,9 @@ SEEDS = range(10_100)
 """Among these each fault must show."""
 
 RARE = {
-    "forgets_what_is_unsent": 350,
-    "leases_what_is_needed": 600,
-    "blames_what_was_dropped": 10_000,
+    "forgets_unsent_tasks": 350,
+    "leases_needed_workers": 600,
+    "blames_dropped_tasks": 10_000,
 }
 """Seeds where the search begins for faults that show late; it goes on with all the others."""
 
@@ -37,7 +37,7 @@ Patch = pytest.MonkeyPatch
 Fault = Callable[[Patch], None]
 
 
-def forgets_what_is_unsent(patch: Patch) -> None:
+def forgets_unsent_tasks(patch: Patch) -> None:
     """Takes what was assigned, but not sent, for something that its worker may have run."""
 
     def lost(self: BatchSender, worker: WorkerEntry) -> set[int]:
@@ -58,7 +58,7 @@ def decides(patch: Patch, change: Callable[[Scheduler, Decisions], Decisions]) -
     patch.setattr(Scheduler, "decide", decide)
 
 
-def replaces_nobody(patch: Patch) -> None:
+def never_replaces_workers(patch: Patch) -> None:
     decides(patch, lambda _, decisions: decisions._replace(start=0))
 
 
@@ -108,15 +108,15 @@ def gives_up_with_workers_at_work(patch: Patch) -> None:
     patch.setattr(scheduler.PoolWorkerSet, "_at_work", lambda _: False)
 
 
-def tells_nobody_that_none_starts(patch: Patch) -> None:
+def hides_that_no_worker_starts(patch: Patch) -> None:
     patch.setattr(scheduler.PoolWorkerSet, "news", lambda *_: "")
 
 
-def hears_nothing_back(patch: Patch) -> None:
+def drops_answers(patch: Patch) -> None:
     patch.setattr(PoolExecutor, "on_recalled", lambda *_: None)
 
 
-def hears_of_no_end(patch: Patch) -> None:
+def drops_ends_of_workers(patch: Patch) -> None:
     """A handle that tells nobody when its worker is gone before it was ready."""
 
     def exited(self: WorkerHandle, report: Any) -> None:
@@ -127,7 +127,7 @@ def hears_of_no_end(patch: Patch) -> None:
     patch.setattr(WorkerHandle, "exited", exited)
 
 
-def dismisses_nobody(patch: Patch) -> None:
+def never_ends_workers(patch: Patch) -> None:
     patch.setattr(WorkerHandle, "dismiss", lambda _: None)
 
 
@@ -139,7 +139,7 @@ def keeps_deadlines(patch: Patch) -> None:
     patch.setattr(BatchSender, "settled", lambda *_: None)
 
 
-def tells_twice(patch: Patch) -> None:
+def reports_twice(patch: Patch) -> None:
     def _put(self: Jobs, receipt: Receipt, *rest: Any) -> None:
         real(self, receipt, *rest)
         real(self, receipt, *rest)
@@ -148,7 +148,7 @@ def tells_twice(patch: Patch) -> None:
     patch.setattr(Jobs, "_put", _put)
 
 
-def tells_others(patch: Patch) -> None:
+def reports_to_others(patch: Patch) -> None:
     def _put(self: Jobs, receipt: Receipt, results: list[Any], *rest: Any) -> None:
         real(self, receipt, results[::-1], *rest)
 
@@ -156,7 +156,7 @@ def tells_others(patch: Patch) -> None:
     patch.setattr(Jobs, "_put", _put)
 
 
-def tells_of_no_loss(patch: Patch) -> None:
+def hides_losses(patch: Patch) -> None:
     def put_losses(self: Jobs, losses: list[Loss], *rest: Any) -> None:
         real(self, losses[1:], *rest)
 
@@ -181,7 +181,7 @@ def unpickles_on_the_loop(patch: Patch) -> None:
     patch.setattr(AnswerReceiver, "_unreadable", _unreadable)
 
 
-def blames_what_was_dropped(patch: Patch) -> None:
+def blames_dropped_tasks(patch: Patch) -> None:
     patch.setattr(BatchSender, "dropped", lambda *_: None)
 
 
@@ -197,11 +197,11 @@ def reads_everything(patch: Patch) -> None:
     patch.setattr(InputStream, "grant", grant)
 
 
-def forgets_who_waits_for_room(patch: Patch) -> None:
+def forgets_calls_that_wait_for_room(patch: Patch) -> None:
     patch.setattr(InputStream, "ask", lambda _: None)
 
 
-def forgets_who_waits_for_input(patch: Patch) -> None:
+def forgets_calls_that_wait_for_input(patch: Patch) -> None:
     patch.setattr(InputStream, "await_input", lambda _: None)
 
 
@@ -209,7 +209,7 @@ def never_resumes(patch: Patch) -> None:
     patch.setattr(Jobs, "resume", lambda *_: None)
 
 
-def holds_nothing_back(patch: Patch) -> None:
+def holds_no_results_back(patch: Patch) -> None:
     patch.setattr(Job, "has_next", property(lambda job: bool(job.waiting)))
 
 
@@ -225,7 +225,7 @@ def acts_later(patch: Patch) -> None:
     patch.setattr(Calls, "_take", _take)
 
 
-def leases_what_is_needed(patch: Patch) -> None:
+def leases_needed_workers(patch: Patch) -> None:
     patch.setattr(Scheduler, "needs_leased", lambda _: False)
 
 
@@ -236,17 +236,17 @@ def forgets_calls_that_take_longer(patch: Patch) -> None:
     patch.setattr(Leases, "_adopt", _adopt)
 
 
-def forgets_who_died_while_leased(patch: Patch) -> None:
+def forgets_workers_that_died_while_leased(patch: Patch) -> None:
     patch.setattr(PoolExecutor, "_back", lambda self, _: self._advance())
 
 
-def never_takes_back_what_nobody_returns(patch: Patch) -> None:
+def never_takes_back_unreturned_workers(patch: Patch) -> None:
     patch.setattr(Leases, "_return_abandoned", lambda *_: None)
 
 
 FAULTS: list[Fault] = [
-    forgets_what_is_unsent,
-    replaces_nobody,
+    forgets_unsent_tasks,
+    never_replaces_workers,
     never_lets_go,
     grows_too_late,
     grows_too_far,
@@ -255,34 +255,34 @@ FAULTS: list[Fault] = [
     gives_up_at_once,
     never_gives_up,
     gives_up_with_workers_at_work,
-    tells_nobody_that_none_starts,
-    hears_nothing_back,
-    hears_of_no_end,
-    dismisses_nobody,
+    hides_that_no_worker_starts,
+    drops_answers,
+    drops_ends_of_workers,
+    never_ends_workers,
     forgets_deadlines,
     keeps_deadlines,
-    tells_twice,
-    tells_others,
-    tells_of_no_loss,
+    reports_twice,
+    reports_to_others,
+    hides_losses,
     pickles_on_the_loop,
     unpickles_on_the_loop,
-    blames_what_was_dropped,
+    blames_dropped_tasks,
     ignores_the_limit,
     reads_everything,
-    forgets_who_waits_for_room,
-    forgets_who_waits_for_input,
+    forgets_calls_that_wait_for_room,
+    forgets_calls_that_wait_for_input,
     never_resumes,
-    holds_nothing_back,
+    holds_no_results_back,
     acts_later,
-    leases_what_is_needed,
+    leases_needed_workers,
     forgets_calls_that_take_longer,
-    forgets_who_died_while_leased,
-    never_takes_back_what_nobody_returns,
+    forgets_workers_that_died_while_leased,
+    never_takes_back_unreturned_workers,
 ]
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_what_is_broken_is_found_out(fault: Fault, monkeypatch: Patch) -> None:
+def test_each_broken_promise_of_the_executor_is_found(fault: Fault, monkeypatch: Patch) -> None:
     fault(monkeypatch)
     first = RARE.get(fault.__name__, 0)
     seeds = [*SEEDS[first:], *SEEDS[:first]]

@@ -96,7 +96,7 @@ def run(seed: int) -> tuple[list[Judge], list[list[bytes]]]:
     return judges, sent
 
 
-def test_connections_that_are_made_again_and_again_and_bring_nothing_are_lost() -> None:
+def test_repeated_connections_without_data_are_lost() -> None:
     loop = SimulatedLoop()
     cable = Cable(loop, drop=1.0)
     judges = [Judge(loop, link) for link in (cable.agent, cable.master)]

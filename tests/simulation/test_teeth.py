@@ -76,7 +76,7 @@ class ChargesAllThatWasRead(Ledger):
         return super().lose(worker, unread, None)
 
 
-class ChargesNobody(Ledger):
+class BlamesNoTask(Ledger):
     def lose(
         self, worker: WorkerEntry, unread: Iterable[int], running: Any, disrupted: bool = False
     ) -> list[Loss]:
@@ -160,7 +160,7 @@ class LendsTheBusy(Ledger):
         return True
 
 
-class GivesToWhoIsLent(Ledger):
+class GivesToLeasedWorkers(Ledger):
     def lease(self, worker: WorkerEntry) -> bool:
         if not super().lease(worker):
             return False
@@ -186,7 +186,7 @@ BROKEN = [
     IgnoresWrongAnswers,
     ChargesUnread,
     ChargesAllThatWasRead,
-    ChargesNobody,
+    BlamesNoTask,
     GivesUpTooEarly,
     RetriesForEver,
     LetsTheBusyLeave,
@@ -200,7 +200,7 @@ BROKEN = [
     PinsToAnyone,
     NeverFinishes,
     LendsTheBusy,
-    GivesToWhoIsLent,
+    GivesToLeasedWorkers,
     ForgetsWhoIsBack,
     ForgetsWhatIsAdopted,
 ]
@@ -211,7 +211,7 @@ def with_broken(broken: type[Ledger]) -> Suite:
 
 
 @pytest.mark.parametrize("broken", BROKEN)
-def test_what_is_broken_is_found_out(broken: type[Ledger]) -> None:
+def test_each_broken_promise_of_the_ledger_is_found(broken: type[Ledger]) -> None:
     assert first_failure(SEEDS, with_broken(broken)) is not None
 
 

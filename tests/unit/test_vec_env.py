@@ -244,7 +244,7 @@ def test_gymnasium_alone_does_not_import_it() -> None:
     assert not {"torch", "stable_baselines3"} & set(done.stdout.split())
 
 
-def test_a_worker_has_what_its_environments_need(vec_env: Make) -> None:
+def test_a_worker_has_the_resources_of_its_environments(vec_env: Make) -> None:
     env = vec_env([wishful, Faulty], num_workers=1)
     (worker,) = env._dispatcher._workers
     assert worker._wishes == Resources(memory=512)
