@@ -91,7 +91,7 @@ class FakeChild:
         self._agent.loop.call_later(_BIRTH, self.begin)
 
     def begin(self) -> None:
-        """Report that the child is ready, if it lives. Runs on the loop's thread, as all that
+        """Report that the child is ready, if it lives. Runs on the loop thread, as all that
         follows."""
         if self._gone:
             return

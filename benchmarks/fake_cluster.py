@@ -122,7 +122,7 @@ class FakeCluster:
         """Return the memory of this process, and of the hosts together."""
         return processes.pss(os.getpid()), sum(processes.pss(host.pid) for host in self._hosts)
 
-    # Runs on the loop's thread.
+    # Runs on the loop thread.
 
     def _link(self, link: Link) -> None:
         self._agents.join(link.peer.name, link)

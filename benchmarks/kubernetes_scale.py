@@ -6,7 +6,7 @@ Other processes (`scripted_cluster`) play the API server, the operator, the node
 the master is real. It makes a pool of as many workers, lets each work, ends the pool, removes all
 pods, and prints a line of JSON for each half. `stalls` are the longest times, in milliseconds, that
 its loop was away from a timer of one millisecond. `turns` are the largest processor times of the
-loop's thread from one look at that timer to the next.
+loop thread from one look at that timer to the next.
 """
 
 from __future__ import annotations

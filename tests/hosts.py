@@ -28,7 +28,7 @@ class Wire:
         self.frames = 0
 
     def send(self, frame: HubMessage) -> None:
-        """Send on the loop's thread, where links are used."""
+        """Send on the loop thread, where links are used."""
         self.frames += 1
         encoded = frame.encode()
         if self.held is None:
@@ -75,7 +75,7 @@ class Hosts:
         return up, down
 
     def on_loop(self, function: object, *args: object) -> None:
-        """Call on the loop's thread."""
+        """Call on the loop thread."""
         self.loop.call_soon(function, *args)  # type: ignore[arg-type]
 
     @contextlib.contextmanager

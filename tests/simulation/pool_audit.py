@@ -134,7 +134,7 @@ class PoolAudit:
     # After every turn
 
     def _after_turn(self) -> None:
-        require(not self._stage.user_code_on_loop, "the user's code runs on the loop's thread")
+        require(not self._stage.user_code_on_loop, "the user's code runs on the loop thread")
         if self._moved:
             self._moved = False
             self._check_ledger()

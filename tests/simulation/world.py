@@ -62,7 +62,7 @@ class Loop(SimulatedLoop):
     def __init__(self, seed: int) -> None:
         super().__init__()
         self.after_turn: Callable[[], None] = lambda: None
-        """Called whenever something was done on the loop's thread."""
+        """Called whenever something was done on the loop thread."""
         self._rng = random.Random(f"{seed} threads")
         self._longest = self._rng.choice(MOMENTS)
         self._thread: str | None = None
@@ -73,7 +73,7 @@ class Loop(SimulatedLoop):
         """Do nothing: this loop never fails."""
 
     def on_thread(self) -> bool:
-        """Return whether the caller may take this for the loop's thread."""
+        """Return whether the caller may take this for the loop thread."""
         return self._thread is None
 
     @contextmanager

@@ -291,7 +291,7 @@ def test_a_finalizer_at_any_line_may_use_the_pool(
 
 @contextlib.contextmanager
 def striking_at_the_loop(action: Callable[[], object]) -> Iterator[Striking]:
-    """The same for the lines that the loop's thread passes."""
+    """The same for the lines that the loop thread passes."""
     loop = runtime().loop
     striking = Striking(action)
     loop.call_soon(striking.begin)
@@ -299,7 +299,7 @@ def striking_at_the_loop(action: Callable[[], object]) -> Iterator[Striking]:
     ended = threading.Event()
     loop.call_soon(striking.end)
     loop.call_soon(ended.set)
-    assert ended.wait(PATIENCE), "the loop's thread waits for something"
+    assert ended.wait(PATIENCE), "the loop thread waits for something"
 
 
 def test_a_finalizer_at_any_line_of_the_loop_may_use_the_pool(pool: Pool) -> None:

@@ -3,7 +3,7 @@
 With the local backend the agent runs inside the program, on the program's loop.  Elsewhere it is a
 separate process (``python -m fiber.agent``), whose observers send events over the link.
 
-The agent runs on the loop's thread.  Any thread may call ``Agent.child``, which registers nothing,
+The agent runs on the loop thread.  Any thread may call ``Agent.child``, which registers nothing,
 and a child's ``recall`` and ``signal``, which only put a call into the loop's queue.  So the agent
 needs no lock, on which a finalizer or a signal handler could block.
 """
@@ -85,7 +85,7 @@ class Agent:
             self._refused(child, error)
 
     def close(self) -> None:
-        """Kill every child and end the zygotes.  Must not be called on the loop's thread."""
+        """Kill every child and end the zygotes.  Must not be called on the loop thread."""
         zygotes: list[ZygoteLink] = []
         taken = threading.Event()
         if self.loop.running:
@@ -160,7 +160,7 @@ class Agent:
         self._access()
         return None if self._hub is None else self._hub.directory
 
-    # Messages of zygotes, on the loop's thread
+    # Messages of zygotes, on the loop thread
 
     def _on_reply(self, link: ZygoteLink, reply: tuple[Any, ...]) -> None:
         """Handle a zygote's message about one of this agent's children."""
@@ -436,7 +436,7 @@ class LocalChild:
             self._loop.resume(self._ours.fileno())
 
     def recall(self) -> None:
-        """Take back unread packets; ``observer.recalled`` gets the answer on the loop's thread."""
+        """Take back unread packets; ``observer.recalled`` gets the answer on the loop thread."""
         self._loop.call_soon(self._send_recalled)
 
     def signal(self, signum: int) -> None:
@@ -460,7 +460,7 @@ class LocalChild:
     def drain_and_close(self) -> tuple[int, ...]:
         """Pass on the dead child's last packets, close its channel and return the unread packets.
 
-        Runs on the loop's thread.
+        Runs on the loop thread.
         """
         self.release_descriptors()
         if self._ours is None or self._theirs is None:

@@ -106,7 +106,7 @@ class ChildSpec:
 
 
 class ChildObserver(Protocol):
-    """Receiver of one child's events.  Called on the loop's thread; must not block."""
+    """Receiver of one child's events.  Called on the loop thread; must not block."""
 
     def started(self, pid: int) -> None:
         """Take note that the child runs as process ``pid``."""
@@ -144,7 +144,7 @@ class DirectChannel(Protocol):
 class ChildHandle(Protocol):
     """Handle by which the master controls one child.  No method blocks.
 
-    Any thread may call ``signal`` and ``recall``.  The others run on the loop's thread.
+    Any thread may call ``signal`` and ``recall``.  The others run on the loop thread.
     """
 
     name: str
@@ -167,7 +167,7 @@ class ChildHandle(Protocol):
         """Reason why the host takes no new work and is about to end; empty if the host stays."""
 
     def start(self) -> None:
-        """Start the child; the observer gets the outcome.  Called once, on the loop's thread."""
+        """Start the child; the observer gets the outcome.  Called once, on the loop thread."""
 
     def deliver(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
         """Send a packet to the child's task channel, with ``seq`` (eight bytes) in front.
@@ -179,11 +179,11 @@ class ChildHandle(Protocol):
         """Return the task channel for direct use by one thread at a time, until ``reclaim``.
 
         None: the child is gone, or its channel cannot be used directly.  Until ``reclaim`` the
-        observer gets no packets, only the child's end.  Runs on the loop's thread.
+        observer gets no packets, only the child's end.  Runs on the loop thread.
         """
 
     def reclaim(self) -> None:
-        """End the direct use: the observer gets the packets again.  Runs on the loop's thread."""
+        """End the direct use: the observer gets the packets again.  Runs on the loop thread."""
 
     def recall(self) -> None:
         """Take back the packets that the child has not read; ``recalled`` says which."""
@@ -213,4 +213,4 @@ class Backend(Protocol):
         """Return a child, not started yet; raise errors that are known already.  Any thread."""
 
     def close(self) -> None:
-        """End all agents and their children.  Must not be called on the loop's thread."""
+        """End all agents and their children.  Must not be called on the loop thread."""

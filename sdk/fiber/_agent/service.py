@@ -39,7 +39,7 @@ the agent stops reading from the child.
 
 
 class AgentService:
-    """Service of one master until the link ends; a ``LinkObserver``.  Runs on the loop's thread.
+    """Service of one master until the link ends; a ``LinkObserver``.  Runs on the loop thread.
 
     ``on_end`` gets the reason of the end, and whether the master was lost.
     """
@@ -322,7 +322,7 @@ _LONGEST = 1 << 13
 
 
 class Capture:
-    """Pipe for one child's stdout and stderr.  Runs on the loop's thread."""
+    """Pipe for one child's stdout and stderr.  Runs on the loop thread."""
 
     def __init__(self, loop: Loop, write: Callable[[str], None], busy: Callable[[], bool]) -> None:
         self._loop = loop

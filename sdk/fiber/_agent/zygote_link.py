@@ -41,7 +41,7 @@ class ZygoteLink:
         ``imports``: as in ``zygote.Zygote``.  ``program``: files that the zygote unpacks to
         ``folder``, for its children.  ``on_reply`` gets the zygote's packets about children.
         ``on_exit`` is called once, and last: the zygote and its children are dead.  Both run on the
-        loop's thread.
+        loop thread.
         """
         self.program = program
         self.folder = folder
@@ -87,11 +87,11 @@ class ZygoteLink:
         self.send(zygote.QUIT)
 
     def send(self, *request: Any) -> None:
-        """Send another request.  Runs on the loop's thread, as ``start``."""
+        """Send another request.  Runs on the loop thread, as ``start``."""
         self._outbox.send(pickle.dumps(request))
 
     def quit(self) -> None:
-        """End the zygote and its children, and wait.  Must not be called on the loop's thread."""
+        """End the zygote and its children, and wait.  Must not be called on the loop thread."""
         if self._has_replied:
             self._loop.call_soon(self.send, zygote.QUIT)
             if not self._loop.running:

@@ -20,7 +20,7 @@ class AgentSet:
 
     ``on_change`` is called when the number of wanted agents may have changed.  ``on_lost`` gets a
     lost agent and the reason, before its children end.  ``on_leaving`` gets an agent that takes no
-    new work.  Any thread may call ``child``.  All else runs on the loop's thread.
+    new work.  Any thread may call ``child``.  All else runs on the loop thread.
     """
 
     def __init__(

@@ -60,7 +60,7 @@ class LoopbackBackend:
     After failures to join, one agent has to succeed before others are started.  When that takes too
     long, the waiting children are refused, and from then on each new child causes one more attempt.
 
-    Only the loop's thread changes the attributes; other threads read them without a lock.
+    Only the loop thread changes the attributes; other threads read them without a lock.
     """
 
     name = "loopback"
@@ -182,7 +182,7 @@ class LoopbackBackend:
             "FIBER_START_TIMEOUT": str(self._config.start_timeout),
         }
 
-    # Events, on the loop's thread
+    # Events, on the loop thread
 
     def _objection(self, identity: Identity) -> str:
         slot = self._by_name.get(identity.name)
@@ -359,7 +359,7 @@ _STATEMENT = "import runpy; runpy.run_module('fiber.agent', run_name='__main__')
 class AgentProcess:
     """Process of an agent, from before its start to after its end.
 
-    ``on_end`` is called once, on the loop's thread.  It gets the reason why the process ended or
+    ``on_end`` is called once, on the loop thread.  It gets the reason why the process ended or
     never began, and whether a signal or a lack of resources caused that.
     """
 

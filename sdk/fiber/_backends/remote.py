@@ -37,7 +37,7 @@ _REMEMBERED = 1024
 
 
 class AgentObserver(Protocol):
-    """Observer of an agent.  Called on the loop's thread."""
+    """Observer of an agent.  Called on the loop thread."""
 
     def lost(self, agent: RemoteAgent, reason: str) -> None:
         """Note that an agent is lost for good.  Its children end after this call."""
@@ -53,7 +53,7 @@ class AgentObserver(Protocol):
 
 
 class Starter(Protocol):
-    """Starter of children, which gives them agents.  Called on the loop's thread."""
+    """Starter of children, which gives them agents.  Called on the loop thread."""
 
     loop: EventLoop
 
@@ -67,7 +67,7 @@ class Starter(Protocol):
 class RemoteAgent:
     """Agent that has dialed in.
 
-    Any thread may call ``send`` and ``close``.  All else runs on the loop's thread.
+    Any thread may call ``send`` and ``close``.  All else runs on the loop thread.
     """
 
     def __init__(
@@ -415,7 +415,7 @@ class BlobSender:
     """Sender of blobs.  It sends each blob once, and Forget when no object refers to the blob.
 
     So an agent keeps no more blobs than this program does.  A blob lives as long as a pool, a child
-    or the program refers to it.  Runs on the loop's thread.
+    or the program refers to it.  Runs on the loop thread.
     """
 
     def __init__(self, loop: EventLoop, send: Send) -> None:
@@ -527,7 +527,7 @@ class RemoteTaskChannel:
         if not self._messages and not self._ended:
             lock.acquire(timeout=timeout)
 
-    # The loop's thread
+    # The loop thread
 
     def put(self, message: Message) -> None:
         """Add a packet of the worker."""

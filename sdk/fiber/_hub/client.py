@@ -130,7 +130,7 @@ def inherited_address() -> HubAddress | None:
 
 
 def _refuse_on_loop() -> None:
-    """Raise RuntimeError on the loop's thread, which would wait for itself."""
+    """Raise RuntimeError on the loop thread, which would wait for itself."""
     if _local_hub is not None and _local_hub.on_loop():
         raise RuntimeError(
             "a callback on Fiber's event loop uses an object of another host: the loop would wait "

@@ -292,7 +292,7 @@ _RELEASE_AGAIN = 0.005
 
 
 class HostedSemaphore:
-    """Semaphore that the hub serves.  Runs on the loop's thread."""
+    """Semaphore that the hub serves.  Runs on the loop thread."""
 
     def __init__(self, loop: Loop, doorbell: Doorbell, block: SharedBlock) -> None:
         self._loop = loop
@@ -384,7 +384,7 @@ A process may die after it notified a waiter and before it rings the doorbell.
 
 
 class HostedWaitList:
-    """Wait list that the hub serves.  Runs on the loop's thread."""
+    """Wait list that the hub serves.  Runs on the loop thread."""
 
     def __init__(self, loop: Loop, doorbell: Doorbell, block: SharedBlock) -> None:
         self._loop = loop

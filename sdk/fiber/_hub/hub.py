@@ -61,7 +61,7 @@ _ACCEPT_AGAIN = 0.1
 
 
 class Hub:
-    """Hub of a host.  Runs on the loop's thread, except methods marked "any thread"."""
+    """Hub of a host.  Runs on the loop thread, except methods marked "any thread"."""
 
     def __init__(
         self, loop: Loop, host: str, parent: str | None = None, directory: str | None = None
@@ -296,7 +296,7 @@ SendHubMessage = Callable[[HubMessage], None]
 
 
 class HubLink:
-    """Hub's part of a link to another host.  Runs on the loop's thread.
+    """Hub's part of a link to another host.  Runs on the loop thread.
 
     Call ``flush`` before any other message is sent over the link.
     """

@@ -202,7 +202,7 @@ def text(payload: memoryview) -> str:
 
 
 class Doorbell:
-    """Doorbell of one hub.  Runs on the loop's thread, except ``ring``."""
+    """Doorbell of one hub.  Runs on the loop thread, except ``ring``."""
 
     def __init__(self, call_soon: Callable[..., None]) -> None:
         self._call_soon = call_soon

@@ -104,7 +104,7 @@ class Grant(NamedTuple):
 
 
 class Registry:
-    """Objects of one hub.  Runs on the loop's thread, except ``register`` and ``release``.
+    """Objects of one hub.  Runs on the loop thread, except ``register`` and ``release``.
 
     Those two take no lock and never wait, so a finalizer or signal handler may interrupt them at
     any step.  They leave a note for the loop.  Each other method reads the notes first, so a grant

@@ -275,7 +275,7 @@ IN, OUT, EDGE = select.EPOLLIN, select.EPOLLOUT, select.EPOLLET
 
 
 class Poller:
-    """Watcher of the hub's descriptors, whose masks change often.  Runs on the loop's thread."""
+    """Watcher of the hub's descriptors, whose masks change often.  Runs on the loop thread."""
 
     def __init__(self, loop: Loop) -> None:
         self._loop = loop
@@ -331,7 +331,7 @@ SendTunnelFrame = Callable[[TunnelFrame], None]
 
 
 class TunnelStream:
-    """End of a tunnel, as a ``Stream``.  Runs on the loop's thread."""
+    """End of a tunnel, as a ``Stream``.  Runs on the loop thread."""
 
     passes_descriptors = False
 
@@ -455,7 +455,7 @@ class Tunnels:
     """Tunnels of one link.
 
     ``send`` takes a frame for the link and does not block.  The hub calls ``on_frame`` with each
-    tunnel frame that comes, and ``lost`` at the end of the link, on the loop's thread.  Exactly one
+    tunnel frame that comes, and ``lost`` at the end of the link, on the loop thread.  Exactly one
     side of a link is its ``dialer``: both sides open tunnels, and their numbers must differ.
     """
 

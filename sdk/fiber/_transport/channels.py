@@ -437,7 +437,7 @@ _Waiting = tuple[BytesLike, Sequence[memoryview], tuple[int, ...]]
 class Outbox:
     """Sending side of a non-blocking socket that the loop already reads.
 
-    Runs on the loop's thread.
+    Runs on the loop thread.
     """
 
     def __init__(self, loop: Loop, sock: socket.socket) -> None:

@@ -62,7 +62,7 @@ class AgentDialer:
     """Agent's end of the link: dials the master until it answers or ``timeout`` seconds are over.
 
     ``address`` is ``host:port``, with commas between several addresses.  With ``timeout`` None the
-    dialer never gives up.  It calls back once, on the loop's thread: ``on_link`` with the link, or
+    dialer never gives up.  It calls back once, on the loop thread: ``on_link`` with the link, or
     ``on_failed`` with an AuthenticationError, VersionMismatch or LinkError.  If the connection
     breaks later, it dials again until the link is lost.  ``connect`` replaces the function that
     makes a connection.
@@ -187,7 +187,7 @@ class AgentDialer:
             return finished.value  # type: ignore[no-any-return]  # typeshed cannot know
         raise MasterUnreachable("dialling was stopped")
 
-    # On the loop's thread
+    # On the loop thread
 
     def _answered(self, answer: bytes, descriptor: int, secrets: Secrets) -> None:
         if self._over.is_set():

@@ -48,7 +48,7 @@ DEFAULT_KEEPALIVE = Keepalive()
 
 
 class LinkObserver(Protocol):
-    """Observer of a link.  Its methods run on the loop's thread and must not block."""
+    """Observer of a link.  Its methods run on the loop thread and must not block."""
 
     def on_frame(self, frame: Frame) -> None:
         """Take the next frame.  The observer owns a writable frame and may change it."""
@@ -159,7 +159,7 @@ class Link:
 
         The frame may be given in pieces.  Large pieces are not copied, and must not change until
         they have arrived.  Large frames of different lanes travel at the same time
-        (``link_protocol`` has the order).  ``on_left`` is called on the loop's thread when the
+        (``link_protocol`` has the order).  ``on_left`` is called on the loop thread when the
         connection has taken the last piece.
         """
         self._loop.call_soon(self._send, frame, lane, on_left)
@@ -174,7 +174,7 @@ class Link:
         """End the link.  The peer's observer gets ``on_lost(reason)``; this side's gets no call.
 
         Frames that were sent still arrive if that takes at most ``linger`` seconds.  ``then`` is
-        called on the loop's thread when the link has ended.
+        called on the loop thread when the link has ended.
         """
         self._observer = None
         self._loop.call_soon(self._close, reason, linger, then)

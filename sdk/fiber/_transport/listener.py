@@ -27,7 +27,7 @@ class MasterListener:
 
     ``at`` is the acceptor that the agents dial, which other pools may share.  Or it is an address
     for a new acceptor, which is closed with the pool.  An address is ``host:port``.  The
-    callbacks run on the loop's thread:
+    callbacks run on the loop thread:
 
     * ``on_agent`` attaches an observer to the new link, or returns why the link is not wanted.
     * ``on_refused`` gets the text to log for a connection that was turned away.
@@ -61,7 +61,7 @@ class MasterListener:
         self._on_unserved = on_unserved
         self._knows = objection
         self.epoch = 0
-        """Number of this master among the masters of the pool.  Used on the loop's thread."""
+        """Number of this master among the masters of the pool.  Used on the loop thread."""
         self._waiting: dict[tuple[str, str], tuple[PendingConnection, AgentHello]] = {}
         self._by_peer: dict[tuple[str, str], Link] = {}
         self._keepalive = keepalive
@@ -120,7 +120,7 @@ class MasterListener:
             self._acceptor.close()
 
     def break_connections(self) -> None:
-        """Break all connections, so that each agent dials again.  Runs on the loop's thread.
+        """Break all connections, so that each agent dials again.  Runs on the loop thread.
 
         An agent that reaches this master again continues its link, and loses nothing.
         """
@@ -128,7 +128,7 @@ class MasterListener:
             link.disconnect()
 
     def look_again(self) -> None:
-        """Decide again about the agents that wait.  Runs on the loop's thread."""
+        """Decide again about the agents that wait.  Runs on the loop thread."""
         waiting, self._waiting = self._waiting, {}
         for pending, hello in waiting.values():
             if not pending.gone:

@@ -60,7 +60,7 @@ class Dependent(Protocol):
     """Object that waits for something that only a loop can bring."""
 
     def broken(self, error: FiberError) -> None:
-        """Note that the loop has failed.  Called once, on the loop's thread."""
+        """Note that the loop has failed.  Called once, on the loop thread."""
 
 
 class ScheduledCall(Protocol):
@@ -80,7 +80,7 @@ class EventLoop(Protocol):
         """Return the time in seconds of a monotonic clock."""
 
     def call_soon(self, callback: Callable[..., None], *args: Any) -> None:
-        """Call ``callback`` on the loop's thread.  Any thread."""
+        """Call ``callback`` on the loop thread.  Any thread."""
 
     def call_later(
         self, seconds: float, callback: Callable[..., None], *args: Any
@@ -150,7 +150,7 @@ class Loop:
         self._thread.start()
 
     def on_thread(self) -> bool:
-        """Tell whether the caller runs on the loop's thread."""
+        """Tell whether the caller runs on the loop thread."""
         return threading.get_ident() == self._ident
 
     @property
@@ -179,7 +179,7 @@ class Loop:
         return time.monotonic()
 
     def call_soon(self, callback: Callable[..., object], *args: Any) -> None:
-        """Call ``callback`` on the loop's thread, after all earlier calls.  From anywhere."""
+        """Call ``callback`` on the loop thread, after all earlier calls.  From anywhere."""
         self._ready.append((callback, args))
         # The loop notes that it goes to sleep, and then looks for calls.  Only the loop takes that
         # note back, so a caller that a signal interrupts here has changed nothing.
@@ -188,7 +188,7 @@ class Loop:
             wakeup.set()
 
     def call_later(self, seconds: float, callback: Callable[..., object], *args: Any) -> LoopTimer:
-        """Call ``callback`` once, ``seconds`` from now, on the loop's thread."""
+        """Call ``callback`` once, ``seconds`` from now, on the loop thread."""
         timer = LoopTimer(self.now() + seconds, partial(callback, *args) if args else callback)
         if self.on_thread():
             self._add_timer(timer)

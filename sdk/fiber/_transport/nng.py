@@ -162,7 +162,7 @@ class _Keys:
 
 
 class SealedConnection:
-    """Connection over nng; a ``LinkConnection``.  Its callbacks run on the loop's thread.
+    """Connection over nng; a ``LinkConnection``.  Its callbacks run on the loop thread.
 
     ``on_gone`` is called once when the connection breaks, and not after ``close``.
     """

@@ -112,7 +112,7 @@ class Pods:
     ``prepare`` returns the pool, and begins to listen for its agents.  It blocks until the event
     that it gets is set, and raises FiberError.  ``successor`` returns the agents of the next pool,
     if another one can follow.  Any thread may call ``agents.child`` and ``close``.  All else runs
-    on the loop's thread.
+    on the loop thread.
     """
 
     def __init__(
@@ -167,7 +167,7 @@ class Pods:
             self._client.begin_close(_END_TIMEOUT)
 
     def close(self) -> None:
-        """End the children and the pool, or detach.  Must not be called on the loop's thread."""
+        """End the children and the pool, or detach.  Must not be called on the loop thread."""
         self._closing.set()
         self._wait_for(lambda then: self._loop.call_soon(self._shut_down, then))
         if (preparation := self._preparation) is not None:  # no other one begins after this

@@ -67,7 +67,7 @@ class AttachablePool(Protocol):
 
 
 class PoolObserver(Protocol):
-    """Observer of a FiberPool.  Its methods run on the loop's thread."""
+    """Observer of a FiberPool.  Its methods run on the loop thread."""
 
     def connected(self) -> int:
         """Return how many agents are linked; called on any thread."""

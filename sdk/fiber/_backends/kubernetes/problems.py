@@ -411,7 +411,7 @@ _EXPIRED = "Lease expired"
 class Reporter:
     """Reporter of the problems of one FiberPool.  Any thread may call it.
 
-    ``on_warning`` and ``on_error`` are called on the loop's thread, ``on_error`` once at most.
+    ``on_warning`` and ``on_error`` are called on the loop thread, ``on_error`` once at most.
     ``on_failure`` follows at once, on the calling thread.
     """
 

@@ -59,7 +59,7 @@ _LONGEST_HOST_NAME = 63
 
 
 class ListenerObserver(Protocol):
-    """Observer of agents that dial in.  Called on the loop's thread."""
+    """Observer of agents that dial in.  Called on the loop thread."""
 
     def on_agent(self, link: Link) -> str | None:
         """Take an agent that has the pool's credentials, or return why it is refused."""

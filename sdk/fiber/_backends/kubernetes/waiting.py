@@ -37,7 +37,7 @@ from fiber.errors import FiberError
 
 
 class WaitingChildren:
-    """Children of one FiberPool that have no agent yet.  Runs on the loop's thread.
+    """Children of one FiberPool that have no agent yet.  Runs on the loop thread.
 
     ``on_begin`` is called when children begin to wait while the pool has no agent.
     """
@@ -239,7 +239,7 @@ _COLUMNS = 80
 class Progress:
     """Display of ``describe()`` on stderr, repeated while a wait lasts.
 
-    Runs on the loop's thread.
+    Runs on the loop thread.
     """
 
     def __init__(self, loop: EventLoop, output: OutputWriter, describe: Callable[[], str]) -> None:
@@ -347,7 +347,7 @@ class ReachabilityProbe:
 class Preparation:
     """Thread that calls ``prepare`` once.
 
-    On the loop's thread, ``on_prepared`` gets its result, or ``on_failed`` its error.
+    On the loop thread, ``on_prepared`` gets its result, or ``on_failed`` its error.
     """
 
     def __init__(
@@ -365,7 +365,7 @@ class Preparation:
         self._thread = threading.Thread(target=self._run, name="fiber-prepare", daemon=True)
 
     def start(self) -> None:
-        """Start the thread.  Runs on the loop's thread."""
+        """Start the thread.  Runs on the loop thread."""
         try:
             self._thread.start()
         except RuntimeError as error:  # the system has no room for a thread
