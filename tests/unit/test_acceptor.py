@@ -86,7 +86,7 @@ STATES = (
 
 
 @pytest.mark.parametrize("state", STATES)
-def test_who_stops_in_the_middle_is_turned_away_in_time_and_told_once(
+def test_a_client_that_stops_halfway_is_rejected_in_time_and_reported_once(
     site: Site, state: str
 ) -> None:
     listener, master = site.listener()
@@ -106,7 +106,7 @@ def test_who_stops_in_the_middle_is_turned_away_in_time_and_told_once(
 
 
 @pytest.mark.parametrize("state", STATES)
-def test_garbage_in_every_state_is_turned_away_and_told_once(site: Site, state: str) -> None:
+def test_garbage_in_every_state_is_rejected_and_reported_once(site: Site, state: str) -> None:
     listener, master = site.listener()
     for _ in range(3):
         visitor = Visitor(site, listener.address)
@@ -130,7 +130,7 @@ def test_a_greeting_without_end_is_turned_away(site: Site) -> None:
     assert "its greeting of 4294967295 bytes is too long" in master.refusals[0]
 
 
-def test_a_proof_that_is_none_is_told_with_the_name_that_it_claims(site: Site) -> None:
+def test_a_false_proof_is_reported_with_the_claimed_name(site: Site) -> None:
     listener, master = site.listener()
     forged = site.credentials.agent("another", "")
     with pytest.raises(authentication.Untrusted, match="does not believe"):
@@ -152,7 +152,7 @@ def test_a_proven_agent_takes_no_strangers_place(site: Site) -> None:
     visitor.close()
 
 
-def test_a_crowd_from_one_address_is_bounded_and_keeps_nobody_out(
+def test_a_crowd_from_one_address_is_bounded_and_blocks_no_agent(
     site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(acceptor, "_MOST", 8)
@@ -201,7 +201,7 @@ def test_without_descriptors_it_goes_on_later_and_says_so_once(
     assert len(master.refusals) == 1
 
 
-def test_connections_that_break_before_they_are_taken_harm_nobody(site: Site) -> None:
+def test_connections_that_break_before_they_are_taken_harm_no_other(site: Site) -> None:
     listener, master = site.listener()
     for _ in range(20):
         sock = socket.create_connection(("127.0.0.1", port_of(listener.address)), PATIENCE)
@@ -238,7 +238,7 @@ def test_one_that_breaks_as_it_is_taken_stays_open_nowhere(site: Site) -> None:
         os.fstat(fd)
 
 
-def test_closing_hangs_up_on_who_is_under_way(site: Site) -> None:
+def test_closing_closes_unfinished_connections(site: Site) -> None:
     listener, _ = site.listener()
     visitors = [Visitor(site, listener.address) for _ in range(3)]
     visitors[1].go("hello of TLS sent")
@@ -252,7 +252,7 @@ def test_closing_hangs_up_on_who_is_under_way(site: Site) -> None:
         assert not end.is_alive()
 
 
-def test_nonsense_in_place_of_a_greeting_is_told_once(site: Site) -> None:
+def test_nonsense_in_place_of_a_greeting_is_reported_once(site: Site) -> None:
     listener, master = site.listener()
     for _ in range(3):
         with pytest.raises(authentication.PeerClosed):
@@ -276,7 +276,7 @@ def test_a_name_that_no_pod_can_have_is_not_repeated(
     assert capfd.readouterr().err == ""  # no traceback for each that comes
 
 
-def test_an_agent_that_nobody_wants_hears_why_and_is_told_once(site: Site) -> None:
+def test_an_unwanted_agent_gets_the_reason_and_is_reported_once(site: Site) -> None:
     listener, master = site.listener()
     listener._on_agent = lambda link: f"{link.peer.name} is not wanted"
     identity = Identity.of_this_process("agent-1", "uid")
@@ -289,7 +289,7 @@ def test_an_agent_that_nobody_wants_hears_why_and_is_told_once(site: Site) -> No
     assert told.startswith("agent-1 is not wanted (127.0.0.1:")
 
 
-def test_an_agent_without_a_pod_is_told_of_whatever_strangers_do(
+def test_an_agent_without_a_pod_is_reported_in_spite_of_strangers(
     site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(acceptor, "_REMEMBERED", 1)
@@ -305,7 +305,7 @@ def test_an_agent_without_a_pod_is_told_of_whatever_strangers_do(
     assert master.refusals[0].startswith("there is no pod 'agent-1' yet, and there was none within")
 
 
-def test_a_crowd_is_told_of_once_from_wherever_it_comes(
+def test_a_crowd_is_reported_once_from_any_address(
     site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(acceptor, "_FAIR_CHANCE", 60.0)

@@ -15,7 +15,7 @@ def test_a_newcomer_beyond_the_bound_for_its_address_waits_its_turn() -> None:
     assert door.enter("d", "2.2.2.2", 0.9) == IN, "who comes from elsewhere is not concerned"
 
 
-def test_who_has_had_a_fair_chance_makes_room() -> None:
+def test_a_client_that_had_a_fair_chance_makes_room() -> None:
     door = Admission(total=10, per_address=2)
     door.enter("a", "1.1.1.1", 0.0)
     door.enter("b", "1.1.1.1", 0.5)
@@ -35,7 +35,7 @@ def test_when_all_is_full_the_address_with_the_most_makes_room() -> None:
     )
 
 
-def test_who_leaves_makes_room() -> None:
+def test_a_client_that_leaves_makes_room() -> None:
     door = Admission(total=1, per_address=1)
     door.enter("a", "1.1.1.1", 0.0)
     door.leave("a")

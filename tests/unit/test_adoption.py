@@ -140,7 +140,7 @@ class TestWhatIsRebound:
             expected = getattr(expected, part)
         assert vars(module)["x"] is expected
 
-    def test_contexts_and_what_belongs_to_them(self, library: Library, fiber: Any) -> None:
+    def test_contexts_and_their_members_are_adopted(self, library: Library, fiber: Any) -> None:
         module: Any = library(
             "import multiprocessing\n"
             "context = multiprocessing.get_context('spawn')\n"
@@ -159,7 +159,7 @@ class TestWhatIsRebound:
         Adoption(module, fiber)
         assert isinstance(make(), Queue)
 
-    def test_nothing_else(self, library: Library, fiber: Any) -> None:
+    def test_other_names_stay(self, library: Library, fiber: Any) -> None:
         module = library(
             "import multiprocessing, threading, queue\n"
             "from multiprocessing.dummy import Pool as ThreadPool\n"
@@ -242,7 +242,9 @@ class TestWhatWasEvaluatedAtImport:
             Adoption(module, fiber)
         assert module.multiprocessing is module.C.mp is multiprocessing
 
-    def test_what_somebody_rebound_meanwhile_is_theirs(self, library: Library, fiber: Any) -> None:
+    def test_a_name_that_was_rebound_meanwhile_stays_rebound(
+        self, library: Library, fiber: Any
+    ) -> None:
         module = library(
             "import multiprocessing as mp\ndef f(a=mp, *, b=mp): return a, b\nclass C: mp = mp"
         )
@@ -256,7 +258,7 @@ class TestWhatWasEvaluatedAtImport:
 
 
 class TestRefusals:
-    def test_names_without_equivalent_are_all_named_and_nothing_changes(
+    def test_names_without_equivalent_are_all_named_and_no_name_changes(
         self, library: Library, fiber: Any
     ) -> None:
         module = library(
@@ -310,7 +312,7 @@ class TestRefusals:
             ),
         ],
     )
-    def test_what_was_fixed_at_import(
+    def test_names_that_were_fixed_at_import_are_reported(
         self, library: Library, fiber: Any, source: str, complaint: str
     ) -> None:
         module = library(f"import multiprocessing\n{source}")
@@ -319,7 +321,9 @@ class TestRefusals:
         assert complaint in str(caught.value)
         assert vars(module)["multiprocessing"] is multiprocessing
 
-    def test_a_module_that_takes_nothing(self, library: Library, fiber: Any) -> None:
+    def test_a_module_that_uses_no_multiprocessing_is_refused(
+        self, library: Library, fiber: Any
+    ) -> None:
         with pytest.raises(AdoptionError, match="none of its names comes from multiprocessing"):
             Adoption(library("import threading"), fiber)
 
@@ -330,7 +334,7 @@ class TestRefusals:
         with pytest.raises(AdoptionError, match=r"inside of it do: library\.vector\.workers"):
             Adoption(library("", "library"), fiber)
 
-    def test_an_empty_adoption_for_what_fiber_shares(self, library: Library, fiber: Any) -> None:
+    def test_an_adoption_of_shared_names_only_is_empty(self, library: Library, fiber: Any) -> None:
         assert Adoption(library("from multiprocessing import TimeoutError"), fiber).names == ()
 
     def test_a_name_that_does_not_import(self) -> None:
@@ -401,7 +405,9 @@ class TestDuration:
             assert module.multiprocessing is multiprocessing
         assert adopted.names == ()
 
-    def test_what_somebody_rebound_in_the_block_is_theirs(self, module: Any, fiber: Any) -> None:
+    def test_a_name_that_was_rebound_in_the_block_stays_rebound(
+        self, module: Any, fiber: Any
+    ) -> None:
         with Adoption(module, fiber):
             module.Queue = "mine"
         assert module.Queue == "mine"
@@ -432,7 +438,7 @@ class TestDuration:
         assert not wrong
         assert module.multiprocessing is multiprocessing
 
-    def test_a_module_that_goes_leaves_nothing_behind(self, fiber: Any) -> None:
+    def test_a_dropped_module_leaves_no_reference(self, fiber: Any) -> None:
         module = ModuleType("passing")
         vars(module)["multiprocessing"] = multiprocessing
         Adoption(module, fiber)

@@ -116,7 +116,7 @@ def test_a_signal_is_reported_by_its_name(shared: Agent, signum: signal.Signals)
     assert report.reason == f"killed by {signum.name}"
 
 
-def test_a_signal_to_one_that_is_gone_is_nothing(shared: Agent) -> None:
+def test_a_signal_to_an_ended_child_does_nothing(shared: Agent) -> None:
     child, observer = begin(shared, os._exit, 0)
     observer.wait_for_exit()
     child.signal(signal.SIGKILL)
@@ -135,7 +135,7 @@ def test_work_goes_out_and_answers_come_back(shared: Agent) -> None:
     end(child, observer)
 
 
-def test_what_a_dead_worker_never_read_is_named(shared: Agent) -> None:
+def test_unread_packets_of_a_dead_worker_are_named(shared: Agent) -> None:
     child, observer = begin(shared, read_never, tasks=True)
     assert observer.wait_for_words(1) == ["ready"]
     payload = bytes(30_000)
@@ -147,7 +147,7 @@ def test_what_a_dead_worker_never_read_is_named(shared: Agent) -> None:
     assert report.running == (17, 4)
 
 
-def test_an_answer_that_nobody_can_handle_ends_its_worker(
+def test_an_answer_that_cannot_be_handled_ends_its_worker(
     shared: Agent, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The master must not wait for it."""
@@ -195,7 +195,7 @@ def test_closing_waits_for_no_import(own: Agent, tmp_path: Path) -> None:
     os.close(writer)
 
 
-def test_what_an_idle_worker_has_not_read_can_be_taken_back(shared: Agent) -> None:
+def test_unread_packets_of_an_idle_worker_can_be_taken_back(shared: Agent) -> None:
     child, observer = begin(shared, read_never, tasks=True)
     observer.wait_for_words(1)
     for seq in (5, 6, 7):

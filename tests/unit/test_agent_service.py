@@ -25,7 +25,7 @@ def service() -> tuple[AgentService, list[tuple[str, bool]]]:
     return AgentService(loop, nothing, nothing, nothing, on_end), ends
 
 
-def test_a_master_that_is_lost_is_told_apart_from_one_that_ends(service: Any) -> None:
+def test_a_lost_master_is_distinguished_from_one_that_ends(service: Any) -> None:
     served, ends = service
     served.on_lost("silence")
     assert ends == [("lost the master: silence", True)]
@@ -45,7 +45,7 @@ def test_a_link_that_is_lost_after_the_master_ended_is_not_the_reason(service: A
     assert ends == [("the master ended", False)]
 
 
-def test_a_child_with_a_large_result_on_its_way_is_not_heard_until_that_has_left() -> None:
+def test_a_child_with_a_large_result_is_paused_until_the_result_has_left() -> None:
     link, child, nothing = mock.Mock(), mock.Mock(), mock.MagicMock()
     loop: Any = SimulatedLoop()
     service = AgentService(loop, link, nothing, nothing, nothing)

@@ -66,7 +66,7 @@ def site() -> Site:
     return Site()
 
 
-def test_who_waits_for_room_is_refused_when_the_last_agent_goes_and_none_will_come(
+def test_children_that_wait_are_refused_when_the_last_agent_goes_for_good(
     site: Site,
 ) -> None:
     agent = site.join("a")
@@ -88,7 +88,7 @@ def test_an_agent_that_is_let_go_is_none_to_wait_for(site: Site) -> None:
     assert child.start_error is ERROR
 
 
-def test_an_agent_whose_pod_ends_gets_no_child_when_it_is_heard_again(site: Site) -> None:
+def test_an_agent_whose_pod_ends_gets_no_child_when_it_reconnects(site: Site) -> None:
     agent = site.join("a")
     site.agents.withhold(agent, True, "ending")
     agent.on_suspect()
@@ -112,7 +112,7 @@ def test_a_signal_that_ends_a_process_ends_one_that_waits_for_an_agent(
     assert not site.placement.waiting
 
 
-def test_others_get_who_waits_and_who_comes_later(site: Site) -> None:
+def test_other_agents_get_waiting_and_later_children(site: Site) -> None:
     other = Site()
     agent = site.join("a")
     (first, _), (_, owner) = site.start(), site.start()
@@ -128,7 +128,7 @@ def test_others_get_who_waits_and_who_comes_later(site: Site) -> None:
     assert owner.report.cause == Cause.AGENT_LOST
 
 
-def test_who_was_handed_over_is_taken_back_where_it_waits_now(site: Site) -> None:
+def test_a_child_that_was_handed_over_is_taken_back_from_its_new_place(site: Site) -> None:
     other = Site()
     child, owner = site.start()
     site.agents.hand_over(lambda: other.agents)

@@ -43,7 +43,7 @@ def test_the_sum_is_that_of_the_parts() -> None:
     assert total == sum(parts)
 
 
-def test_what_is_built_this_time_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pending_builds_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(build, "missing", lambda _: ["kubelet"])
     assert re.search(rf"{build.minutes()} min  building Kubernetes", announcement([], {}))
     assert "building" not in announcement([], {"KUBECONFIG": "/some/where"})
@@ -53,7 +53,7 @@ def test_a_given_cluster_is_named() -> None:
     assert "on the cluster of KUBECONFIG" in announcement([], {"KUBECONFIG": "/some/where"})
 
 
-def test_what_is_left_out_has_its_reasons(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_skipped_parts_have_reasons(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ability, "obstacles", lambda: ["it takes root"])
     runs, _, left_out = announcement(OTHERS[:1], {}).partition("left out:")
     assert "the operator's scenarios" not in runs

@@ -74,7 +74,7 @@ def _say_unknown_of_own(rig: Rig, liar: WorkerHandle, other: WorkerHandle) -> No
         _say_of_own(0, None, 1e-3, [1], [(0, work.VALUE, "text", 0)]),
     ],
 )
-def test_a_wrong_answer_ends_its_worker_and_nothing_else(
+def test_a_wrong_answer_only_ends_its_worker(
     rig: Rig, lie: Callable[[Rig, WorkerHandle, WorkerHandle], None]
 ) -> None:
     first, second = rig.call(), rig.call()
@@ -125,7 +125,7 @@ def number_of(handle: WorkerHandle) -> int:
     return handle.worker.queue[0].seq
 
 
-def test_an_agent_gives_back_only_what_its_own_worker_has(rig: Rig) -> None:
+def test_an_agent_gives_back_only_the_packets_of_its_worker(rig: Rig) -> None:
     first, one, _, other = two_calls(rig)
     other.recalled([number_of(one)])
     assert len(rig.child(one).packets) == 1, "the task of another worker was given out again"
@@ -134,7 +134,7 @@ def test_an_agent_gives_back_only_what_its_own_worker_has(rig: Rig) -> None:
     assert first.outcomes == {0: 9}
 
 
-def test_an_exit_report_blames_and_spares_only_the_tasks_of_its_own_worker(rig: Rig) -> None:
+def test_an_exit_report_charges_only_the_tasks_of_its_worker(rig: Rig) -> None:
     first, one, second, other = two_calls(rig)
     jobs = [batch.job for batch in rig.ledger.batches.values()]
     rig.lose(other, unread=(number_of(one),), running=(number_of(one), 0))

@@ -82,7 +82,7 @@ def test_files_are_short() -> None:
     assert usual >= 0.75 * len(lengths)
 
 
-def test_names_say_what_is_inside() -> None:
+def test_names_of_modules_describe_their_contents() -> None:
     assert [path for path in python_files() if path.stem.strip("_") in VAGUE_NAMES] == []
 
 
@@ -98,7 +98,7 @@ def test_a_class_name_names_one_class() -> None:
     assert {name for name, count in defined.items() if count > 1} == SAME_NAMES
 
 
-def test_nothing_shadows_the_standard_library() -> None:
+def test_no_module_shadows_the_standard_library() -> None:
     """A regular package named operator, ours or a test's, would hide the standard library's."""
     packages = {path.parent.name for path in ROOT.glob("[!.]*/**/__init__.py")}
     assert packages & sys.stdlib_module_names == set()

@@ -52,7 +52,7 @@ def test_a_block_is_used_again_once_its_reader_released_it(blocks: Arena) -> Non
     blocks.settle(block, sent=False)
 
 
-def test_a_block_read_in_place_is_its_senders_again_once_nobody_looks_at_it(blocks: Arena) -> None:
+def test_a_block_read_in_place_returns_to_its_sender_after_its_last_view(blocks: Arena) -> None:
     block = blocks.claim(1000)
     fill(block, [memoryview(b"content")], [DATA_OFFSET])
     blocks.settle(block, sent=True)
@@ -102,7 +102,7 @@ def test_where_no_descriptor_is_left_a_block_is_copied(
     blocks.settle(block, sent=False)
 
 
-def test_only_what_its_sender_cannot_cut_is_read_in_place(blocks: Arena) -> None:
+def test_only_blocks_that_cannot_be_truncated_are_read_in_place(blocks: Arena) -> None:
     block = blocks.claim(1000)
     with pytest.raises(PermissionError):
         os.ftruncate(block.fd, 0)
@@ -139,7 +139,7 @@ def test_blocks_of_readers_that_died_are_forgotten_in_their_turn(blocks: Arena) 
     assert sum(block.capacity for block in blocks._blocks) <= RETAINED_LIMIT
 
 
-def test_many_small_messages_that_nobody_reads_do_not_eat_the_descriptors(blocks: Arena) -> None:
+def test_many_unread_small_messages_do_not_exhaust_the_descriptors(blocks: Arena) -> None:
     before = len(os.listdir("/proc/self/fd"))
     for _ in range(300):
         blocks.settle(blocks.claim(70_000), sent=True)

@@ -107,7 +107,7 @@ def test_a_frame_that_is_not_passed_on_takes_no_descriptor() -> None:
     assert whole.frame() == frame
 
 
-def test_the_master_keeps_what_children_send_it_and_passes_on_the_rest() -> None:
+def test_the_master_keeps_its_childrens_messages_and_forwards_the_rest() -> None:
     assert not is_passed_on(FromChild(1, b"result").encode())
     assert is_passed_on(Deliver(1, 2, b"task").encode())
     assert is_passed_on(TunnelData(1, b"item").encode())

@@ -84,7 +84,7 @@ def test_each_result_is_that_of_its_call(manager: Any) -> None:
     assert results[0].get() == 1, "as often as one likes"
 
 
-def test_each_thread_has_the_results_of_its_own_calls(manager: Any) -> None:
+def test_each_thread_gets_the_results_of_its_calls(manager: Any) -> None:
     desk = manager.Desk()
 
     def ask(size: int) -> set[int]:
@@ -168,7 +168,7 @@ def test_a_result_can_be_a_proxy(manager: Any) -> None:
     assert wait_until(lambda: manager._number_of_objects() == objects, PATIENCE)
 
 
-def test_results_that_nobody_reads_hold_nobody_up(manager: Any) -> None:
+def test_unread_results_block_no_caller(manager: Any) -> None:
     desk = manager.Desk()
     for _ in range(300):
         desk.fill(10_000)
@@ -177,7 +177,7 @@ def test_results_that_nobody_reads_hold_nobody_up(manager: Any) -> None:
     assert len(kept[-1].get(PATIENCE)) == 10_000
 
 
-def test_what_was_asked_for_before_the_proxy_went_is_done(manager: Any) -> None:
+def test_calls_made_before_the_proxy_went_are_carried_out(manager: Any) -> None:
     desk = manager.Desk()
     make, arguments = desk.__reduce__()
     other = make(*arguments)
@@ -202,7 +202,7 @@ def test_threads_share_a_proxy(manager: Any) -> None:
     assert sorted(got) == list(range(1, 401))
 
 
-def test_who_waits_for_what_another_reads_is_woken(manager: Any) -> None:
+def test_a_thread_is_woken_if_another_reads_its_result(manager: Any) -> None:
     desk = manager.Desk()
     make, arguments = desk.__reduce__()
     first, second = desk.wait(), desk.add(1)
@@ -274,7 +274,7 @@ def test_it_serves_no_other_programs() -> None:
         DeskManager(serializer="xmlrpclib")
 
 
-def test_a_fork_has_a_connection_of_its_own(manager: Any) -> None:
+def test_a_fork_has_a_separate_connection(manager: Any) -> None:
     desk = manager.Desk()
     assert desk.add(1).get(PATIENCE) == 1
     pid = os.fork()

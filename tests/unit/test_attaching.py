@@ -132,7 +132,7 @@ def worker() -> Iterator[tuple[BatchRunner, Results]]:
 
 
 @pytest.mark.parametrize("function", [keep, keep_and_return])
-def test_a_result_comes_after_what_the_task_keeps_is_attached(
+def test_a_result_comes_after_the_kept_objects_are_attached(
     lend: Callable[..., tuple[Connection, packet.Message, GrantSet]],
     worker: tuple[BatchRunner, Results],
     wire: Wire,
@@ -154,7 +154,7 @@ def test_a_result_comes_after_what_the_task_keeps_is_attached(
     assert reader.recv() == "still there"
 
 
-def test_what_a_task_does_not_keep_is_not_waited_for(
+def test_objects_that_a_task_drops_are_not_waited_for(
     lend: Callable[..., tuple[Connection, packet.Message, GrantSet]],
     worker: tuple[BatchRunner, Results],
     wire: Wire,
@@ -173,7 +173,7 @@ def use_and_keep(thing: Any) -> None:
     KEPT.append(thing)
 
 
-def test_what_was_used_is_not_asked_about(
+def test_used_objects_need_no_confirmation(
     lend: Callable[..., tuple[Connection, packet.Message, GrantSet]],
     worker: tuple[BatchRunner, Results],
     is_confirming: Callable[[], bool],

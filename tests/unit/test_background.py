@@ -68,7 +68,7 @@ def test_one_that_was_never_needed_ends_at_once() -> None:
     thread.join()
 
 
-def test_after_stop_what_was_submitted_is_done_and_no_more_is_taken() -> None:
+def test_after_stop_submitted_work_is_done_and_new_work_refused() -> None:
     thread = BackgroundThread("test-background")
     gate, seen = threading.Event(), []
     thread.submit(gate.wait, PATIENCE)
@@ -82,7 +82,7 @@ def test_after_stop_what_was_submitted_is_done_and_no_more_is_taken() -> None:
 
 
 @pytest.mark.parametrize("needed", [True, False])
-def test_what_follows_its_end_is_called_last(needed: bool) -> None:
+def test_the_callback_of_the_end_runs_last(needed: bool) -> None:
     thread, seen = BackgroundThread("test-background"), []
     if needed:
         thread.submit(seen.append, 1)
@@ -92,7 +92,7 @@ def test_what_follows_its_end_is_called_last(needed: bool) -> None:
 
 
 @pytest.mark.parametrize("kind", [ValueError, SystemExit, KeyboardInterrupt])
-def test_what_raises_is_shown_and_stops_nothing(
+def test_an_exception_is_shown_and_does_not_stop_the_thread(
     thread: BackgroundThread, monkeypatch: pytest.MonkeyPatch, kind: type[BaseException]
 ) -> None:
     shown: list[Any] = []
@@ -109,7 +109,7 @@ def test_what_raises_is_shown_and_stops_nothing(
     assert (shown, seen) == ([kind], [1])
 
 
-def test_what_it_does_may_stop_and_join_it(thread: BackgroundThread) -> None:
+def test_its_work_may_stop_and_join_it(thread: BackgroundThread) -> None:
     done = threading.Event()
 
     def end() -> None:
@@ -121,7 +121,7 @@ def test_what_it_does_may_stop_and_join_it(thread: BackgroundThread) -> None:
     assert done.wait(PATIENCE)
 
 
-def test_it_keeps_nothing_of_what_is_done(thread: BackgroundThread) -> None:
+def test_it_keeps_no_reference_to_finished_work(thread: BackgroundThread) -> None:
     class Held:
         def use(self) -> None:
             pass

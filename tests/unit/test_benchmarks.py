@@ -118,7 +118,7 @@ def test_budget_that_asks_for_at_least() -> None:
     assert (found.kept, found.measured, found.verdict) == (False, "37.5x", "missed by 25.0 %")
 
 
-def test_budget_of_what_was_not_measured() -> None:
+def test_budget_of_an_unmeasured_case() -> None:
     budget = budget_for(overhead.case_name(0.001, "chunksize 1"))
     assert budgets.judge(budget, {}).kept is None
     run = Run(dict(ABOUT))
@@ -161,7 +161,7 @@ def test_case_names_are_unique_in_a_measure() -> None:
         assert len(names) == len(set(names)), name
 
 
-def test_page_shows_ratio_budget_failures_and_who_was_skipped() -> None:
+def test_page_shows_ratio_budget_failures_and_skipped_contenders() -> None:
     run = overhead_run(0.5, 1.0)
     run.fail(overhead.case_name(0.0001, "chunksize 1"), "spark", "not finished after 20 s")
     page = report.page("overhead", run)
@@ -193,7 +193,7 @@ def test_the_index_names_pages_of_other_commands_that_are_there(tmp_path: Path) 
     assert "(kubernetes.md)" not in index
 
 
-def test_an_absent_peer_names_what_is_missing() -> None:
+def test_an_absent_peer_names_the_missing_package() -> None:
     peer = contenders.Contender("x", "X", ("no_such_module_at_all",), frozenset(), "#000000", "o")
     assert peer.missing() == "no_such_module_at_all"
 
@@ -209,7 +209,7 @@ def latency_case(*, limit: float, **params: object) -> Case:
     return Case("latency", "apply", "", "apply", params, (Metric("p50", "p50", "s"),), limit=limit)
 
 
-def test_what_a_contender_raises_is_told(session: Session) -> None:
+def test_an_exception_of_a_contender_is_reported(session: Session) -> None:
     with pytest.raises(Failed, match=r"TypeError: .*missing 1 required positional argument"):
         session.run(latency_case(limit=20.0, calls=1))
 
@@ -224,7 +224,7 @@ def test_a_contender_that_takes_too_long_is_stopped_with_its_workers(session: Se
     assert not any(os.path.exists(f"/proc/{pid}") for pid in (session.pid, *below))
 
 
-def test_a_contender_that_dies_is_told(session: Session) -> None:
+def test_the_death_of_a_contender_is_reported(session: Session) -> None:
     case = Case("no_such_measure", "x", "", "map", {}, (), limit=20.0)
     with pytest.raises(Failed, match="exit status 1: ModuleNotFoundError"):
         session.run(case)

@@ -44,7 +44,9 @@ def test_every_budget_is_on_something_that_is_measured() -> None:
 
 
 @pytest.mark.parametrize(("pods", "kept"), [(1.0, True), (1.03, False)])
-def test_tasks_of_a_millisecond_and_more_cost_nothing(pods: float, kept: bool) -> None:
+def test_budgets_bound_the_overhead_of_tasks_of_a_millisecond_and_more(
+    pods: float, kept: bool
+) -> None:
     verdicts = budgets.verdicts(runs_of(pods, 1.0), budgets.ON_PODS)
     found = [each for each in verdicts if each.budget.measure == "overhead"]
     assert len(found) == 8
@@ -69,7 +71,7 @@ def test_the_page_leads_to_the_notes_where_there_are_some() -> None:
     assert kubernetes_report.NOTES not in kubernetes_report.page(runs)
 
 
-def test_pods_are_no_part_of_what_needs_no_cluster() -> None:
+def test_pods_are_measured_only_with_a_cluster() -> None:
     assert ON_PODS not in ALL
     assert BY_NAME[PODS] is ON_PODS
     assert not {each.contender for each in budgets.BUDGETS} & {PODS}
@@ -101,7 +103,7 @@ def test_a_measure_runs(measure: str) -> None:
         assert all(value > 0 for value in sample.values())
 
 
-def test_where_another_cluster_is_named_nothing_is_brought_up(
+def test_no_cluster_is_started_if_another_is_named(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("KUBECONFIG", "/somewhere/else")

@@ -56,7 +56,7 @@ ABOUT = about(rounds=2)
         ("cpu  0 0 0 0 0 0 0 0 0 0", 0.0),
     ],
 )
-def test_the_share_in_use_is_what_was_not_idle(after: str, share: float) -> None:
+def test_the_share_in_use_excludes_idle_time(after: str, share: float) -> None:
     before = "cpu  0 0 0 0 0 0 0 0 0 0\ncpu0 1 2 3"
     assert machine.share_in_use(before, after) == pytest.approx(share)
 
@@ -90,7 +90,7 @@ def test_the_page_says_whether_the_machine_was_idle(in_use: list[float], words: 
     assert words in report.page("latency", Run(dict(ABOUT), in_use=in_use))
 
 
-def test_a_case_with_rounds_of_its_own_has_them_however_long_they_take(
+def test_a_case_with_a_fixed_number_of_rounds_runs_them_all(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(rounds, "LONG", 0.0)
@@ -217,7 +217,7 @@ def test_a_fake_child_is_ready_at_once_and_runs_its_tasks() -> None:
     assert (seq, offset, kept, values, odd) == (7, 0, None, [42], ())
 
 
-def test_a_fake_child_ends_once_when_told_to_or_killed() -> None:
+def test_a_fake_child_ends_once_on_request_or_when_killed() -> None:
     loop, heard, child = fake_child()
     child.deliver(8, work.STOP_MESSAGE)
     child.signal(signal.SIGKILL)
@@ -241,7 +241,7 @@ def test_a_fake_child_that_was_killed_before_it_was_there_never_is() -> None:
     assert heard.words == [(-signal.SIGKILL, "host-1")]
 
 
-def test_what_was_taken_back_was_run_before() -> None:
+def test_recalled_tasks_were_run_before() -> None:
     loop, heard, child = fake_child()
     child.deliver(9, work.pack_calls([(pickle.dumps((no_op, (1,), {})), ())]))
     child.recall()
@@ -262,9 +262,7 @@ def test_an_order_survives_its_line() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("measure", [agents, workers])
-def test_what_knows_the_engine_from_inside_works_with_it_as_it_is(
-    measure: Any, tmp_path: Path
-) -> None:
+def test_measures_of_the_engines_internals_work_with_it(measure: Any, tmp_path: Path) -> None:
     case = measure.cases(0.002)[0]
     session = Session(contenders.BY_NAME["fiber"], tmp_path)
     try:

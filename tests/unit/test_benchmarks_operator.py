@@ -111,7 +111,7 @@ def test_neither_is_always_the_first() -> None:
         ({}, False),
     ],
 )
-def test_settled_is_what_the_status_says_of_this_spec(
+def test_settled_means_that_the_status_describes_this_spec(
     status: dict[str, int], settled: bool
 ) -> None:
     assert is_settled({"metadata": {"generation": 2}, "status": status}, 5) is settled
@@ -125,11 +125,11 @@ def test_requests_are_added_up_by_verb_and_resource() -> None:
         counters.value(page, "process_open_fds")
 
 
-def test_writes_are_those_of_everybody_but_for_heartbeats() -> None:
+def test_writes_of_all_clients_count_except_heartbeats() -> None:
     assert counters.server_writes(SERVER_PAGE) == {"POST pods": 8, "PATCH pods/status": 9}
 
 
-def test_growth_leaves_out_what_did_not_grow() -> None:
+def test_growth_omits_constant_parts() -> None:
     grown = counters.growth({"a": 1.0, "b": 2.0}, {"a": 3.0, "b": 2.0, "c": 5.0})
     assert list(grown.items()) == [("c", 5.0), ("a", 2.0)]
 
@@ -199,7 +199,7 @@ def test_each_case_has_its_budget() -> None:
 
 
 @pytest.mark.parametrize(("seconds", "verdict"), [(9.9, "met"), (11.0, "missed by 10.0 %")])
-def test_what_kubernetes_does_by_default_is_not_to_be_faster(seconds: float, verdict: str) -> None:
+def test_kubernetes_defaults_need_not_be_beaten(seconds: float, verdict: str) -> None:
     known = result((seconds, 9.0), (99.0, 9.0))
     known.trials.append(done(BY_DEFAULT, 0, 10.0))
     found = [line for line in report.budgets({"1000": known}) if "of 20" in line.what]
@@ -208,7 +208,7 @@ def test_what_kubernetes_does_by_default_is_not_to_be_faster(seconds: float, ver
     assert f"| 10.0 s | {seconds / 10:.3g}" in report.page({"1000": known}, notes=False)
 
 
-def test_budgets_of_what_was_not_measured() -> None:
+def test_budgets_of_unmeasured_cases() -> None:
     found = report.budgets({"5000": result((1.0, 1.0))})
     of_1000 = [line for line in found if "1,000 pods" in line.what]
     assert [line.verdict for line in of_1000] == ["not measured"] * 3
@@ -383,7 +383,7 @@ CASE = Case("tiny", "3 times 4 pods", 3, 4, rounds=1, limit=5.0)
 
 
 @pytest.mark.parametrize("subject", SUBJECTS, ids=lambda subject: subject.name)
-def test_a_trial_times_each_step_and_leaves_nothing(
+def test_a_trial_times_each_step_and_leaves_no_object(
     kube: Fake, api: Api, operator: Operator, subject: Subject
 ) -> None:
     found = trial.run(kube, operator, CASE, subject, 1)
@@ -414,9 +414,7 @@ def test_a_watch_may_begin_before_it_is_wholly_made(monkeypatch: pytest.MonkeyPa
     assert [count for _, count in watched.Watched(Listed(), "/pools", 0.0).ready] == [0]
 
 
-def test_a_pool_that_nobody_looks_at_is_told_and_removed(
-    kube: Fake, api: Api, operator: Operator
-) -> None:
+def test_an_unserved_pool_is_reported_and_removed(kube: Fake, api: Api, operator: Operator) -> None:
     api.idle = True
     case = Case("tiny", "4 pods", 1, 4, rounds=1, limit=0.2)
     with pytest.raises(trial.TooSlow, match=r"FiberPool, 4 pods: .* does not watch all namespaces"):
@@ -447,7 +445,7 @@ def pod(name: str, ready: str = "True") -> dict[str, Any]:
     }
 
 
-def test_what_is_missing_is_told(kube: Fake, api: Api) -> None:
+def test_missing_parts_are_reported(kube: Fake, api: Api) -> None:
     with pytest.raises(CannotMeasure, match=r"does not know FiberPools .* --set-up"):
         find_operator(kube)
     kube.get = lambda path, **query: {}  # type: ignore[method-assign]
@@ -481,7 +479,7 @@ def test_nodes_must_have_room(kube: Fake, api: Api) -> None:
         (("--set-up",), "/nowhere", "--set-up is for the cluster of tests/cluster"),
     ],
 )
-def test_without_a_cluster_it_says_what_to_do(
+def test_without_a_cluster_the_remedy_is_printed(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],

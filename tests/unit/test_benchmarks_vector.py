@@ -55,7 +55,7 @@ def test_thousands_of_processes_are_not_run_and_the_table_says_so() -> None:
     assert len(rows) == 2 * 4  # CartPoles, and the three others that have a process each
 
 
-def test_what_is_not_run_is_not_started(tmp_path: Path) -> None:
+def test_skipped_contenders_are_not_started(tmp_path: Path) -> None:
     case, runs = case_of(vector, MANY, 1.0), {"vector": Run(dict(ABOUT))}
     contender = contenders.BY_NAME["async-vector-env"]
     assert case.needs in contender.offers
@@ -131,7 +131,7 @@ def test_steps_as_long_as_the_measure_are_made_twice(monkeypatch: pytest.MonkeyP
     assert len(made) == 2
 
 
-def test_fiber_sends_what_is_ready_first(tmp_path: Path) -> None:
+def test_fiber_sends_ready_environments_first(tmp_path: Path) -> None:
     session = Session(contenders.BY_NAME["fiber"], tmp_path)
     try:
         sample = session.run(case_of(vector, vector.uneven(8, first_ready=True)))
@@ -155,7 +155,7 @@ def test_a_loop_runs_its_tasks(name: str, monkeypatch: pytest.MonkeyPatch) -> No
     assert sample["rate"] > 0
 
 
-def test_who_has_servers_gets_a_tenth_of_the_no_ops(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_contenders_with_servers_get_a_tenth_of_the_no_ops(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[int] = []
     monkeypatch.setattr(executors, "rate", lambda batch, tasks: float(asked.append(tasks) or 1))
     with_threads(monkeypatch)
@@ -256,14 +256,14 @@ def test_actors_of_ray_get_their_actions_in_the_order_of_the_batch(
     alone.close()
 
 
-def test_what_is_only_imported_has_a_stand_in_where_it_is_missing(tmp_path: Path) -> None:
+def test_missing_packages_that_are_only_imported_have_stand_ins(tmp_path: Path) -> None:
     for names, there in ((("no_such_module",), True), (("json",), False), ((), False)):
         peer = contenders.Contender("x", "X", (), frozenset(), "#000000", "o", by_name=names)
         path = _environment(peer, tmp_path)["PYTHONPATH"]
         assert path.endswith("tests/stand_ins") is there, names
 
 
-def test_who_takes_part_in_a_measure_has_an_adapter_for_it() -> None:
+def test_each_contender_of_a_measure_has_an_adapter() -> None:
     vectors = {
         each.name
         for each in (*contenders.ALL, contenders.ON_PODS)

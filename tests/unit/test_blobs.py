@@ -89,7 +89,7 @@ def test_the_same_content_made_anew_in_time_is_not_sent_again() -> None:
     assert len(sent.kinds()) == 1
 
 
-def test_what_an_agent_could_not_keep_is_sent_again() -> None:
+def test_a_blob_that_an_agent_could_not_keep_is_sent_again() -> None:
     sent, blob = Sent(), Blob(b"content")
     sent.need(blob)
     sent.parcels.lost(blob.digest)
@@ -132,9 +132,7 @@ def test_a_blob_that_is_sent_again_has_left_when_both_have() -> None:
 
 
 @pytest.mark.parametrize("data", [b"", b"content"])
-def test_a_store_keeps_what_it_is_sent_until_it_is_told_to_forget(
-    data: bytes, tmp_path: Any
-) -> None:
+def test_a_store_keeps_a_blob_until_the_release(data: bytes, tmp_path: Any) -> None:
     store, digest = BlobStore(str(tmp_path)), Blob(data).digest
     store.put(messages.KeepBlob(digest, data))
     held = store.get(digest)
@@ -199,7 +197,7 @@ def test_large_arguments_are_pickled_once_for_all_workers(method: str) -> None:
     assert Counted.pickled == 1
 
 
-def test_what_holds_a_handle_is_pickled_for_each() -> None:
+def test_an_object_with_a_handle_is_pickled_for_each() -> None:
     ours, theirs = fiber.Pipe()
     for same_host in (True, False):
         assert reduction.dump_shared((theirs,), same_host=same_host) is None
@@ -212,7 +210,7 @@ def test_what_holds_a_handle_is_pickled_for_each() -> None:
     theirs.close()
 
 
-def test_what_does_not_pickle_is_named_as_ever() -> None:
+def test_an_object_that_does_not_pickle_is_named() -> None:
     with pytest.raises(fiber.UnpicklableError, match=r"argument 1 of process .* \(at \[1\]\)"):
         fiber.Pool(1, keep, (bytes(LARGE), (i for i in range(3))))
 

@@ -25,7 +25,7 @@ def called(rig: Rig, queue: CallQueue, number: int) -> CallFuture:
     return future
 
 
-def test_what_is_cancelled_before_it_is_sent_is_not(rig: Rig) -> None:
+def test_a_call_that_is_cancelled_before_sending_is_not_sent(rig: Rig) -> None:
     queue = CallQueue(cancellable=True)
     rig.loop.held = True
     calls = [called(rig, queue, number) for number in range(4)]
@@ -38,7 +38,7 @@ def test_what_is_cancelled_before_it_is_sent_is_not(rig: Rig) -> None:
     assert not calls[1].cancel()
 
 
-def test_what_is_cancelled_while_it_waits_leaves_no_work(rig: Rig) -> None:
+def test_a_call_that_is_cancelled_while_it_waits_leaves_no_work(rig: Rig) -> None:
     queue = CallQueue(cancellable=True)
     calls = [called(rig, queue, number) for number in range(10)]
     given = sum(call.running() for call in calls)
@@ -66,7 +66,7 @@ def test_options_are_those_of_the_queue(rig: Rig) -> None:
     assert {job.charges.limits.retries for job in rig.ledger.jobs} == {0, 5}
 
 
-def test_who_waits_at_the_end_hears_of_it(rig: Rig) -> None:
+def test_a_waiting_caller_gets_the_end(rig: Rig) -> None:
     queue = CallQueue(cancellable=True)
     calls = [called(rig, queue, number) for number in range(5)]
     cancelled = calls[4]
@@ -79,7 +79,7 @@ def test_who_waits_at_the_end_hears_of_it(rig: Rig) -> None:
         cancelled.result(0)
 
 
-def test_to_cancel_all_lets_run_what_runs(rig: Rig) -> None:
+def test_cancelling_all_spares_running_calls(rig: Rig) -> None:
     queue = CallQueue(cancellable=True)
     calls = [called(rig, queue, number) for number in range(10)]
     results = rig.map(range(100))

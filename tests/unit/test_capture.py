@@ -85,7 +85,7 @@ def test_windows_ends_of_lines_and_broken_text_do_no_harm(captured: Captured) ->
     assert captured.finish() == ("a", "\ufffd\ufffd", "")
 
 
-def test_a_line_without_end_is_passed_on_in_pieces(captured: Captured) -> None:
+def test_an_endless_line_is_passed_on_in_pieces(captured: Captured) -> None:
     captured.write(b"x" * 20_000)
     assert [len(piece) for piece in captured.wait_for(2)] == [8192, 8192]
     captured.hang_up()
@@ -100,7 +100,9 @@ def test_an_output_that_was_closed_early_costs_no_processor(captured: Captured) 
     assert captured.finish() == ("last",)
 
 
-def test_while_the_link_is_behind_the_writer_waits_and_nothing_is_lost(captured: Captured) -> None:
+def test_the_writer_waits_while_the_link_is_behind_and_no_output_is_lost(
+    captured: Captured,
+) -> None:
     captured.busy = True
     os.set_blocking(captured.out, False)
     written = 0
@@ -113,7 +115,7 @@ def test_while_the_link_is_behind_the_writer_waits_and_nothing_is_lost(captured:
     captured.hang_up()
 
 
-def test_the_end_is_not_held_up_by_someone_who_writes_on_for_ever(captured: Captured) -> None:
+def test_a_process_that_writes_for_ever_does_not_delay_the_end(captured: Captured) -> None:
     flood = subprocess.Popen(["yes"], stdout=captured.out)
     captured.hang_up()
     captured.wait_for(1000)
@@ -128,7 +130,7 @@ def test_finished_twice_is_finished_once(captured: Captured) -> None:
     assert captured.lines() == ["only"]
 
 
-def test_a_child_that_never_started_leaves_nothing(loop: Loop) -> None:
+def test_a_child_that_never_started_leaves_no_descriptor(loop: Loop) -> None:
     before = len(os.listdir("/proc/self/fd"))
     made = Capture(loop, print, lambda: False)
     assert made.finish() == ()

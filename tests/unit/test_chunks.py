@@ -52,7 +52,7 @@ def test_less_than_a_message_is_worth_does_not_queue() -> None:
     assert short.may_queue(101)
 
 
-def test_growth_is_bounded_by_what_was_measured() -> None:
+def test_growth_is_bounded_by_the_measured_time() -> None:
     known = pace(1e-7, tasks=3)
     assert known.batch_size(MANY, 1) == 3 * GROWTH
 
@@ -85,7 +85,7 @@ def test_no_time_at_all_is_a_time() -> None:
     assert pace(0.0).stride() == STRIDE_LIMIT
 
 
-def test_nothing_measured_changes_nothing() -> None:
+def test_without_a_measurement_the_size_stays() -> None:
     known = pace(1e-3)
     known.observe(0, 5.0)
     assert known.seconds == pytest.approx(1e-3)

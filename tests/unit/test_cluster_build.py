@@ -55,7 +55,7 @@ def test_programs_are_built_once(go_calls: Path) -> None:
     assert build.missing("kwok") == ["kwok"]
 
 
-def test_two_who_build_at_once_build_once(go_calls: Path) -> None:
+def test_two_simultaneous_builds_build_once(go_calls: Path) -> None:
     threads = [threading.Thread(target=build.build, args=(["helm"],)) for _ in range(2)]
     for thread in threads:
         thread.start()
@@ -64,7 +64,7 @@ def test_two_who_build_at_once_build_once(go_calls: Path) -> None:
     assert len(go_calls.read_text().splitlines()) == 1
 
 
-def test_a_build_that_fails_leaves_nothing_that_looks_built(
+def test_a_failed_build_leaves_no_file_that_looks_built(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     install_go(monkeypatch, tmp_path, f"{GO}\necho 'no space left' >&2\nexit 1\n")
@@ -73,7 +73,7 @@ def test_a_build_that_fails_leaves_nothing_that_looks_built(
     assert build.missing("helm") == ["helm"]
 
 
-def test_no_go_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_go_is_an_error_with_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shutil.which", lambda *_, **__: None)
     with pytest.raises(ClusterError, match=r"install Go .* or name a cluster .* with KUBECONFIG"):
         build.build(["helm"])
@@ -88,11 +88,11 @@ def test_missing_packages_are_named_once() -> None:
     assert packages.missing(wanted) == ["first"]
 
 
-def test_nothing_is_asked_for_when_nothing_is_missing() -> None:
+def test_complete_packages_cause_no_installation() -> None:
     packages.need({"sh": "dash", Path("/bin/sh"): "dash"}, "test")
 
 
-def test_who_cannot_install_is_told_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_user_who_cannot_install_gets_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
     with pytest.raises(ClusterError, match=r"to fly, .* sudo apt-get install some-wings"):
         packages.need({"no-such-program": "some-wings"}, "fly")
@@ -146,7 +146,7 @@ def test_a_lock_is_waited_for(tmp_path: Path) -> None:
     assert order == ["first", "second"]
 
 
-def test_who_waits_for_kubernetes_is_told_what_for_and_how_long(
+def test_the_wait_for_kubernetes_is_announced_with_its_length(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     install_go(monkeypatch, tmp_path, GO.replace("helm", "kubernetes"))

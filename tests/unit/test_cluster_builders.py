@@ -126,7 +126,7 @@ def test_a_build_gets_the_settings_as_secrets(
     assert not file.exists()
 
 
-def test_without_settings_nothing_is_set(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_settings_no_variable_is_set(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(builders, "pip_config", list)
     monkeypatch.delenv("SSL_CERT_FILE", raising=False)
     with secrets() as options:

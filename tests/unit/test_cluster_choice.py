@@ -119,7 +119,7 @@ def test_where_there_is_none_each_reason_is_given() -> None:
     ],
     ids=["cut off", "apiserver"],
 )
-def test_what_a_cluster_cannot_do_skips_the_test(
+def test_a_missing_ability_of_the_cluster_skips_the_test(
     harm: Callable[[Cluster], AbstractContextManager[None]],
 ) -> None:
     some = Cluster()

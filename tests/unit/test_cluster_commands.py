@@ -62,7 +62,7 @@ def test_up_with_images_exports_the_one_for_the_examples(
 
 
 @pytest.mark.parametrize("command", ["up", "env"])
-def test_what_the_nodes_have_already_is_exported(
+def test_the_images_of_the_nodes_are_exported(
     command: str,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
@@ -76,7 +76,7 @@ def test_what_the_nodes_have_already_is_exported(
     ]
 
 
-def test_status_tells_what_does_not_run(
+def test_status_names_the_parts_that_do_not_run(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(places, "STATE", tmp_path)

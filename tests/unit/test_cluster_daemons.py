@@ -98,7 +98,7 @@ def test_a_number_that_is_somebody_elses_by_now_is_not_killed() -> None:
     daemon.kill()  # and we are still here
 
 
-def test_what_it_started_ends_with_it() -> None:
+def test_its_children_end_with_it() -> None:
     daemon = Daemon("parent")
     script = 'sleep 300.125 & echo "child $!"; wait; true'
     daemon.start("sh", "-c", script)
@@ -116,7 +116,7 @@ def is_alive(pid: int) -> bool:
     return state != "Z"
 
 
-def test_it_knows_nothing_of_who_started_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_inherits_no_state_of_its_starter(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SECRET_OF_THE_TESTS", "yes")
     daemon = Daemon("printer")
     daemon.start("env")
@@ -125,7 +125,7 @@ def test_it_knows_nothing_of_who_started_it(monkeypatch: pytest.MonkeyPatch) -> 
     assert f"{places.programs()}:" in daemon.log.read_text()
 
 
-def test_it_does_not_hear_our_interrupts() -> None:
+def test_it_ignores_interrupts_of_the_terminal() -> None:
     daemon = Daemon("sleeper")
     daemon.start(*SLEEP)
     assert os.getpgid(pid_of(daemon)) == pid_of(daemon) != os.getpgid(0)

@@ -35,7 +35,7 @@ def ended() -> Callable[[str], str]:
     return say
 
 
-def test_nothing_is_said_while_all_run() -> None:
+def test_running_daemons_need_no_diagnosis() -> None:
     daemon = Daemon("sleeper")
     daemon.start("sleep", "300.0625")
     assert diagnosis.end_of([daemon]) is None
@@ -71,7 +71,7 @@ def test_the_kernels_killings_are_counted_from_its_start(
     assert "the kernel has killed 2 of the machine's processes for want of memory" in said
 
 
-def test_whoever_kills_what_watches_leaves_no_status() -> None:
+def test_a_killed_watcher_leaves_no_status() -> None:
     daemon = Daemon("sleeper")
     daemon.start("sleep", "300.0625")
     daemon.kill()
@@ -86,7 +86,7 @@ def test_the_status_of_an_earlier_run_is_forgotten(ended: Callable[[str], str]) 
 
 
 @pytest.mark.parametrize("scarce", ["memory", "disk"])
-def test_what_the_machine_lacks_is_said(
+def test_missing_abilities_of_the_machine_are_named(
     scarce: str, ended: Callable[[str], str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ample, little = 64 << 30, 17 << 20
@@ -106,7 +106,7 @@ def test_one_that_runs_and_does_not_answer_is_quoted() -> None:
     assert "\nwaiting for etcd\n" in said
 
 
-def test_all_that_fails_at_the_same_time_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_simultaneous_failures_are_all_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(what: str) -> Callable[..., None]:
         def start(*_: object) -> None:
             raise ClusterError(f"{what} is not well")

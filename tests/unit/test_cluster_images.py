@@ -87,7 +87,7 @@ def test_a_tag_stands_for_contents(image: Image, checkout: Path) -> None:
     assert image.reference(checkout, BASE) != before
 
 
-def test_a_tag_tells_files_apart(checkout: Path) -> None:
+def test_a_tag_identifies_the_files(checkout: Path) -> None:
     write(checkout / "sdk/fiber/a.py", "xy")
     write(checkout / "sdk/fiber/b.py", "")
     before = WORKER.reference(checkout, BASE)
@@ -105,7 +105,7 @@ def test_neither_image_depends_on_the_other_side(
     assert image.reference(checkout, BASE) == before
 
 
-def test_only_what_has_changed_is_built(builder: Notebook, checkout: Path) -> None:
+def test_only_changed_images_are_built(builder: Notebook, checkout: Path) -> None:
     first = images.build_images()
     assert builder.asked == list(first.values())
     assert list(first) == ["fiber-operator", "fiber-worker", "fiber-worker-rl"]
@@ -124,13 +124,13 @@ def test_a_missing_archive_is_made_again(builder: Notebook) -> None:
     assert builder.asked[3:] == [first["fiber-worker"]]
 
 
-def test_an_archive_holds_what_its_record_says(builder: Notebook) -> None:
+def test_an_archive_matches_its_record(builder: Notebook) -> None:
     references = images.build_images()
     for image in IMAGES:
         assert image.archive.read_text() == image.archived() == references[image.name]
 
 
-def test_nodes_get_what_they_do_not_have_and_know_it_by_its_version(
+def test_nodes_get_only_missing_images_and_tag_them_with_the_version(
     builder: Notebook, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     nodes = {index: FakeNode() for index in (1, 2)}
@@ -169,7 +169,7 @@ class FakeNode:
         self.names[other] = reference
 
 
-def test_what_all_nodes_have_is_known(builder: Notebook, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_images_on_all_nodes_are_known(builder: Notebook, monkeypatch: pytest.MonkeyPatch) -> None:
     nodes = {index: FakeNode() for index in (1, 2)}
     monkeypatch.setattr(places, "nodes", lambda: list(nodes))
     monkeypatch.setattr(images, "Containerd", lambda index: nodes[index])
@@ -224,7 +224,7 @@ def test_a_build_that_fails_is_done_again(builder: Notebook, checkout: Path) -> 
     assert builder.asked[3:] == [references["fiber-worker"], references["fiber-worker-rl"]]
 
 
-def test_a_build_sees_the_inputs_and_nothing_else(builder: Notebook, checkout: Path) -> None:
+def test_a_build_sees_only_the_inputs(builder: Notebook, checkout: Path) -> None:
     write(checkout / "secret.txt", "not for the image")
     images.build_images()  # the worker's is the last
     assert builder.seen == {
@@ -236,9 +236,7 @@ def test_a_build_sees_the_inputs_and_nothing_else(builder: Notebook, checkout: P
     }
 
 
-def test_a_build_is_told_base_and_version(
-    builder: Notebook, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_build_gets_base_and_version(builder: Notebook, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("BASE_IMAGE", "python:3.13-slim")
     images.build_images()
     assert "BASE_IMAGE=base-of-python:3.13-slim" in builder.options
@@ -263,7 +261,7 @@ def covers(path: str, other: str) -> bool:
 
 
 @pytest.mark.parametrize("image", IMAGES, ids=lambda image: image.name)
-def test_what_is_copied_is_known_as_an_input(image: Image) -> None:
+def test_copied_files_are_inputs(image: Image) -> None:
     inputs = (*image.sources, *images.ALWAYS)
     for source in copied(image.dockerfile):
         assert any(covers(source, name) or covers(name, source) for name in inputs), source

@@ -169,7 +169,7 @@ def cleared(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
 
 
 @pytest.mark.usefixtures("running")
-def test_what_a_reboot_left_is_cleared(
+def test_remains_of_a_reboot_are_cleared(
     monkeypatch: pytest.MonkeyPatch, cleared: list[bool]
 ) -> None:
     Found("/home/me/fiber", str(places.cache()), 2).write()
@@ -179,7 +179,7 @@ def test_what_a_reboot_left_is_cleared(
 
 
 @pytest.mark.usefixtures("whole_network")
-def test_a_cluster_of_which_nothing_runs_is_cleared(cleared: list[bool]) -> None:
+def test_a_cluster_without_processes_is_cleared(cleared: list[bool]) -> None:
     """Not gone on with: a benchmark killed in it would still be in its etcd."""
     Found("/home/me/fiber", str(places.cache()), 2).write()
     assert lifecycle.find() is None

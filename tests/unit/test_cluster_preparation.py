@@ -42,7 +42,7 @@ def test_a_machine_that_cannot_run_it_builds_helm_alone(
     assert done == ["helm"]
 
 
-def test_what_goes_wrong_is_said_and_no_error(
+def test_a_failed_preparation_is_reported_and_is_no_error(
     done: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def need(*_: object) -> None:

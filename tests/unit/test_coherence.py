@@ -37,7 +37,7 @@ writes = st.lists(
 
 
 @given(writes, writes)
-def test_what_is_written_on_either_side_arrives(ours: object, theirs: object) -> None:
+def test_writes_on_either_side_arrive(ours: object, theirs: object) -> None:
     pair = Pair()
     for memory, written, send in (
         (pair.home, ours, pair.send_down),
@@ -75,7 +75,7 @@ def test_of_two_that_write_the_same_byte_the_home_decides() -> None:
     assert pair.other[0] == 3
 
 
-def test_what_is_written_here_and_not_sent_yet_is_kept() -> None:
+def test_unsent_local_writes_are_kept() -> None:
     pair = Pair()
     pair.home[0:4] = b"aaaa"
     pair.other[1:3] = b"bb"
@@ -104,7 +104,7 @@ def test_little_is_sent_for_little_and_large_patches_go_in_pieces() -> None:
         b"\0" * 8 + b"\xff\xff\0\0" + bytes(80_000),  # longer than any
     ],
 )
-def test_what_is_no_patch_changes_nothing(patch: bytes) -> None:
+def test_an_invalid_patch_changes_no_byte(patch: bytes) -> None:
     pair = Pair()
     with pytest.raises((ValueError, Exception), match=r"malformed|buffer"):
         pair.down.merge(memoryview(patch))

@@ -107,7 +107,7 @@ def test_all_are_notified_from_elsewhere(brought: Callable[[Any], Any]) -> None:
     assert not here._waiters.waiters()
 
 
-def test_who_waits_has_let_go_of_the_lock_and_gets_it_back(brought: Callable[[Any], Any]) -> None:
+def test_a_waiter_releases_the_lock_and_gets_it_back(brought: Callable[[Any], Any]) -> None:
     here = fiber.Condition()
     there = brought(here)
     with there, there:
@@ -146,7 +146,7 @@ def test_ctrl_c_as_a_wait_begins_leaves_no_waiter(
         assert not there.wait(0)
 
 
-def test_wait_for_says_what_the_predicate_says(brought: Callable[[Any], Any]) -> None:
+def test_wait_for_returns_the_predicates_value(brought: Callable[[Any], Any]) -> None:
     there = brought(fiber.Condition())
     with there:
         assert there.wait_for(lambda: 0, timeout=0.01) == 0
@@ -160,7 +160,7 @@ def test_without_the_lock_it_is_refused(brought: Callable[[Any], Any]) -> None:
             call()
 
 
-def test_who_was_killed_while_it_waited_is_passed_over() -> None:
+def test_a_waiter_that_was_killed_is_skipped() -> None:
     condition, woken = fiber.Condition(), []
     pid = fork_that(lambda: condition.acquire() and condition.wait())
     wait_until(lambda: condition._waiters.waiters() == 1, PATIENCE)
@@ -174,7 +174,7 @@ def test_who_was_killed_while_it_waited_is_passed_over() -> None:
     assert woken == ["living"]
 
 
-def test_who_died_elsewhere_while_it_waited_is_passed_over(hosts: Hosts) -> None:
+def test_a_waiter_that_died_elsewhere_is_skipped(hosts: Hosts) -> None:
     condition, woken = fiber.Condition(), []
     there = Far(hosts)(condition)
     place = there._waiters.enter()
@@ -188,7 +188,7 @@ def test_who_died_elsewhere_while_it_waited_is_passed_over(hosts: Hosts) -> None
     assert woken == ["living"]
 
 
-def test_one_elsewhere_wakes_though_the_doorbell_was_never_rung(
+def test_a_remote_notify_wakes_without_the_doorbell(
     hosts: Hosts, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(hosted, "_LOOK", 0.01)
@@ -253,7 +253,7 @@ def test_a_timeout_breaks_it_until_it_is_reset(brought: Callable[[Any], Any]) ->
     assert there.n_waiting == 0
 
 
-def test_one_killed_before_it_was_counted_takes_nobodys_place() -> None:
+def test_a_waiter_killed_before_it_was_counted_takes_no_place() -> None:
     barrier = fiber.Barrier(2)
 
     def wait_to_come_in() -> None:
@@ -275,7 +275,7 @@ def test_one_killed_before_it_was_counted_takes_nobodys_place() -> None:
     assert barrier.n_waiting == 0
 
 
-def test_a_barrier_for_nobody_is_refused() -> None:
+def test_a_barrier_without_parties_is_refused() -> None:
     with pytest.raises(ValueError, match="0"):
         fiber.Barrier(0)
 

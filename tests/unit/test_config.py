@@ -167,11 +167,11 @@ class TestSources:
         monkeypatch.setenv(f"FIBER_{entry.name.upper()}", "/tmp")
         assert load({entry.name: None}, environ={}) == Config()
 
-    def test_what_an_agent_is_told_is_not_configuration(self) -> None:
+    def test_the_variables_of_an_agent_are_not_configuration(self) -> None:
         environ = dict.fromkeys(config.AGENT_VARIABLES, "x") | {"OTHER": "y"}
         assert load(environ=environ) == Config()
 
-    def test_an_agent_is_told_nothing_else(self) -> None:
+    def test_an_agent_gets_no_other_variables(self) -> None:
         named = {value for value in vars(agent).values() if str(value).startswith("FIBER_AGENT_")}
         assert named <= config.AGENT_VARIABLES
         assert named
@@ -214,7 +214,9 @@ class TestUnknownKeys:
         ("variable", "meant"),
         [("FIBER_AGENT_ADRESS", "FIBER_AGENT_ADDRESS"), ("FIBER_AGENT_COUNT", "FIBER_AGENTS")],
     )
-    def test_beside_those_that_an_agent_is_told(self, variable: str, meant: str) -> None:
+    def test_variables_beside_those_of_an_agent_get_suggestions(
+        self, variable: str, meant: str
+    ) -> None:
         with pytest.raises(ConfigError, match=f"{variable}. Did you mean '{meant}'?"):
             load(environ={variable: "4"})
 
@@ -227,7 +229,7 @@ class TestUnknownKeys:
         assert str(path) in text
         assert "Did you mean 'listen_port'?" in text
 
-    def test_nothing_is_guessed_for_a_name_like_no_other(self) -> None:
+    def test_an_unfamiliar_name_gets_no_suggestion(self) -> None:
         with pytest.raises(ConfigError) as caught:
             load({"zzz": 3})
         assert "Did you mean" not in str(caught.value)
@@ -442,7 +444,7 @@ class TestInit:
         config.init(retries=1)
         assert config.current() == Config(retries=1)
 
-    def test_a_refused_call_changes_nothing(self) -> None:
+    def test_a_refused_call_changes_no_setting(self) -> None:
         config.init(agents=4)
         with pytest.raises(ConfigError):
             config.init(agents=0)
@@ -569,7 +571,7 @@ class TestKeysOfTheOriginal:
             ("lost_after", 1.0, "lost_after must be longer"),
         ],
     )
-    def test_a_bad_attribute_changes_nothing(self, key: str, value: object, words: str) -> None:
+    def test_a_bad_attribute_changes_no_setting(self, key: str, value: object, words: str) -> None:
         with pytest.raises(ConfigError, match=words):
             setattr(config, key, value)
         assert config.current() == Config()
@@ -581,7 +583,7 @@ class TestKeysOfTheOriginal:
         setattr(config, "retries", 7)  # noqa: B010
         assert config.current().retries == 7
 
-    def test_a_key_that_is_read_says_what_replaces_it(self) -> None:
+    def test_reading_an_old_key_names_its_replacement(self) -> None:
         with pytest.raises(AttributeError, match=r"original Fiber alone\. Set backend"):
             getattr(config, "default_backend")  # noqa: B009
         with pytest.raises(AttributeError, match=r"no attribute 'no_such_key'$"):

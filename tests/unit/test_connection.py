@@ -61,7 +61,7 @@ def test_a_simplex_pipe_has_a_direction() -> None:
             receive()
 
 
-def test_what_has_no_pickle_is_an_error_and_nothing_is_sent() -> None:
+def test_an_object_without_a_pickle_is_an_error_and_not_sent() -> None:
     one, other = Pipe()
     with pytest.raises(TypeError, match="pickle"):
         one.send(threading.Lock())
@@ -187,7 +187,7 @@ def test_a_thousand_pipes() -> None:
 # The end
 
 
-def test_closing_tells_the_other_end_after_the_last_message(
+def test_closing_reports_the_end_after_the_last_message(
     pipe: tuple[Connection, Connection],
 ) -> None:
     one, other = pipe
@@ -289,7 +289,7 @@ def test_the_end_says_how_a_process_died_that_is_still_exiting(
 # Waiting
 
 
-def test_poll_waits_as_long_as_told() -> None:
+def test_poll_waits_for_the_given_time() -> None:
     one, other = Pipe()
     assert not other.poll(0.01)
     assert not other.poll(-1)
@@ -383,7 +383,7 @@ def test_sending_connections_leaves_no_descriptor_behind() -> None:
     process.join(PATIENCE)
 
 
-def test_what_could_not_be_sent_keeps_no_end_of_another_pipe_open() -> None:
+def test_a_failed_send_keeps_no_end_of_another_pipe_open() -> None:
     one, _other = Pipe()
     inner, inner_other = Pipe()
     with pytest.raises(UnpicklableError, match=r"\(at \[1\]\)"):
@@ -436,7 +436,7 @@ def answer_late(here: Connection, there: Connection, looks: list[float]) -> thre
     return thread
 
 
-def test_who_has_asked_nothing_does_not_look(
+def test_a_process_that_has_asked_no_question_does_not_poll(
     pipe: tuple[Connection, Connection], looks: list[float]
 ) -> None:
     here, there = pipe
@@ -445,7 +445,7 @@ def test_who_has_asked_nothing_does_not_look(
     assert looks == []
 
 
-def test_who_has_asked_somebody_else_since_does_not_look(
+def test_a_process_that_asked_another_one_since_does_not_poll(
     pipe: tuple[Connection, Connection], looks: list[float]
 ) -> None:
     here, there = pipe
@@ -459,7 +459,7 @@ def test_who_has_asked_somebody_else_since_does_not_look(
     its_end.close()
 
 
-def test_who_waits_for_an_answer_looks_and_then_sleeps(
+def test_a_process_that_waits_for_an_answer_polls_and_then_sleeps(
     pipe: tuple[Connection, Connection], looks: list[float]
 ) -> None:
     here, there = pipe

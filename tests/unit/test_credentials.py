@@ -22,7 +22,7 @@ def credentials() -> MasterCredentials:
     return make_credentials()
 
 
-def test_each_agent_has_a_key_of_its_own(credentials: MasterCredentials) -> None:
+def test_each_agent_has_a_separate_key(credentials: MasterCredentials) -> None:
     pods = [("a", "1"), ("a", "2"), ("b", "1"), ("a1", ""), ("a 1", "2"), ("a", "1 2")]
     keys = {credentials.agent(*pod).key for pod in pods}
     assert len(keys) == len(pods)
@@ -55,7 +55,7 @@ def mounted(folder: Path, credentials: MasterCredentials) -> dict[str, str]:
     }
 
 
-def test_what_the_init_container_writes_the_agent_reads_once(
+def test_the_agent_reads_the_init_containers_output_once(
     credentials: MasterCredentials, tmp_path: Path
 ) -> None:
     environment = mounted(tmp_path, credentials)
@@ -145,7 +145,7 @@ def not_credentials() -> list[bytes]:
 
 
 @pytest.mark.parametrize("value", not_credentials())
-def test_what_else_a_descriptor_brings_is_refused_and_not_repeated(value: bytes) -> None:
+def test_other_content_of_a_descriptor_is_refused_and_not_repeated(value: bytes) -> None:
     reader, writer = os.pipe()
     os.write(writer, value)
     os.close(writer)

@@ -104,14 +104,14 @@ def test_unknown_names_of_the_module_are_attribute_errors() -> None:
         (errors.UnpicklableError, pickle.PicklingError),
     ],
 )
-def test_what_callers_of_multiprocessing_catch(
+def test_handlers_for_multiprocessings_errors_catch_fibers(
     ours: type[Exception], caught_as: type[Exception]
 ) -> None:
     assert issubclass(ours, caught_as)
     assert issubclass(ours, errors.FiberError)
 
 
-def test_worker_died_tells_what_why_and_what_to_do() -> None:
+def test_worker_died_names_the_event_the_reason_and_the_remedy() -> None:
     text = str(worker_died())
     for part in ("task 17 (train)", "Worker-3", "node-1", "4711", "killed by SIGKILL", "4 times"):
         assert part in text
@@ -198,7 +198,7 @@ def test_start_error_shows_the_cause_of_the_other_process() -> None:
     assert error.cause == cause
 
 
-def test_too_many_open_files_names_the_limit_and_what_to_set() -> None:
+def test_too_many_open_files_names_the_limit_and_the_setting() -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     error = errors.TooManyOpenFiles("making a pipe")
     assert error.errno == errno.EMFILE
@@ -208,7 +208,7 @@ def test_too_many_open_files_names_the_limit_and_what_to_set() -> None:
         assert part in str(error)
 
 
-def test_file_too_large_names_the_limit_and_what_to_set() -> None:
+def test_file_too_large_names_the_limit_and_the_setting() -> None:
     soft, _ = resource.getrlimit(resource.RLIMIT_FSIZE)
     error = errors.FileTooLarge("sending a message")
     assert (error.errno, error.limit) == (errno.EFBIG, soft)

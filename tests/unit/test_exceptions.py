@@ -93,7 +93,7 @@ def attributes(error: BaseException) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("error", KINDS, ids=lambda error: type(error).__name__)
-def test_a_copy_is_the_same_but_for_its_identity(error: BaseException) -> None:
+def test_a_copy_differs_only_in_its_identity(error: BaseException) -> None:
     copy = fresh(error)
     assert copy is not error
     assert type(copy) is type(error)
@@ -174,7 +174,9 @@ def test_raising_a_copy_leaves_the_original_as_it_was() -> None:
     assert error.__context__ is None
 
 
-def test_what_cannot_be_copied_is_raised_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_exception_that_cannot_be_copied_is_raised_itself(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     error = Demanding(0.5, step=3)
     monkeypatch.setattr(Demanding, "__new__", len, raising=False)  # native, and refuses
     assert fresh(error) is error

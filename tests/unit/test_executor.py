@@ -74,7 +74,7 @@ def test_many_short_calls_in_a_row_travel_together(rig: Rig) -> None:
     assert len(list(rig.deliveries())) - sent < 10
 
 
-def test_a_loop_that_is_about_to_look_for_calls_is_not_told_of_each(
+def test_a_loop_that_is_about_to_look_for_calls_is_woken_once(
     rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rig.call()
@@ -145,7 +145,7 @@ def test_plain_items_are_sent_from_the_loop(rig: Rig) -> None:
     assert not rig.background.submitted
 
 
-def test_idle_workers_get_what_busy_ones_have_not_read(rig: Rig) -> None:
+def test_idle_workers_get_unread_tasks_of_busy_ones(rig: Rig) -> None:
     results = rig.map(range(4))
     idle, busy = rig.handles
     for seq, _ in list(rig.children[0].packets):
@@ -193,7 +193,7 @@ def test_broadcast(rig: Rig) -> None:
 # Streams
 
 
-def test_what_is_read_is_fed_and_the_end_is_the_end(rig: Rig) -> None:
+def test_read_items_are_fed_until_the_end(rig: Rig) -> None:
     results = Results()
     item = rig.item(results)
     stream = rig.executor.open_stream(item)
@@ -265,7 +265,7 @@ def test_a_batch_that_its_worker_cannot_read_is_sent_in_pieces(rig: Rig) -> None
     assert all("no such class" in str(o.decode().error) for o in results.outcomes.values())
 
 
-def test_a_finished_request_keeps_nothing(rig: Rig) -> None:
+def test_a_finished_request_keeps_no_references(rig: Rig) -> None:
     # A wait for the collector is long where large arrays count as one object each.
     gc.disable()
     try:
@@ -292,7 +292,7 @@ def test_a_cancelled_batch_is_not_sent(rig: Rig, pickled: list[int]) -> None:
     assert len(rig.ledger.idle()) == 2
 
 
-def test_cancelling_what_is_done_or_was_never_submitted_does_nothing(rig: Rig) -> None:
+def test_cancelling_a_done_or_unsubmitted_call_does_nothing(rig: Rig) -> None:
     results = Results()
     item = rig.item(results)
     rig.executor.cancel(item)
@@ -305,9 +305,7 @@ def test_cancelling_what_is_done_or_was_never_submitted_does_nothing(rig: Rig) -
 # Losing
 
 
-def test_what_was_assigned_and_not_sent_is_not_held_against_its_tasks(
-    rig: Rig, pickled: list[int]
-) -> None:
+def test_assigned_but_unsent_tasks_are_not_charged(rig: Rig, pickled: list[int]) -> None:
     rig.map([tasks.Tattling(n) for n in range(2)])
     (job,) = rig.maps
     rig.lose(rig.handles[0])
@@ -315,7 +313,7 @@ def test_what_was_assigned_and_not_sent_is_not_held_against_its_tasks(
     assert rig.ledger.demand() == 2
 
 
-def test_a_packet_that_nobody_took_is_not_held_against_its_tasks(rig: Rig) -> None:
+def test_an_unreceived_packet_is_not_charged_to_its_tasks(rig: Rig) -> None:
     rig.children[0].gone = rig.children[1].gone = True
     rig.map(range(2))
     (job,) = rig.maps
@@ -324,7 +322,7 @@ def test_a_packet_that_nobody_took_is_not_held_against_its_tasks(rig: Rig) -> No
     assert job.charges.deaths == {}
 
 
-def test_what_ran_when_its_worker_died_is_charged_an_attempt(rig: Rig) -> None:
+def test_the_running_task_of_a_dead_worker_is_charged_an_attempt(rig: Rig) -> None:
     results = rig.map(range(1), timeout=60.0)
     (batch,) = rig.ledger.batches.values()
     job = batch.job
@@ -379,7 +377,7 @@ def test_an_answer_that_comes_before_its_worker_ends_counts(rig: Rig) -> None:
     assert (results.outcomes, results.done) == ({0: 9}, 1)
 
 
-def test_nobody_waits_long_for_the_end_of_a_worker(rig: Rig) -> None:
+def test_the_end_of_a_worker_is_waited_for_briefly(rig: Rig) -> None:
     results = rig.call(timeout=2.0)
     (handle,) = rig.busy
     rig.loop.pass_time(2.0)
@@ -394,7 +392,7 @@ def test_nobody_waits_long_for_the_end_of_a_worker(rig: Rig) -> None:
 # The end
 
 
-def test_a_worker_that_was_told_to_end_as_a_recall_was_on_its_way_is_told_again(rig: Rig) -> None:
+def test_a_worker_gets_its_stop_again_after_a_recall(rig: Rig) -> None:
     rig.executor.close()
     told = rig.children[0].packets
     assert told == [(0, work.STOP_MESSAGE)]
@@ -402,7 +400,7 @@ def test_a_worker_that_was_told_to_end_as_a_recall_was_on_its_way_is_told_again(
     assert told == [(0, work.STOP_MESSAGE)] * 2
 
 
-def test_a_call_that_a_recall_took_from_a_lent_worker_is_sent_again(rig: Rig) -> None:
+def test_a_call_that_a_recall_took_from_a_leased_worker_is_sent_again(rig: Rig) -> None:
     class Recalled:
         """The channel of a worker: what is sent on it meets a recall that was on its way."""
 
@@ -430,7 +428,7 @@ def test_a_call_that_a_recall_took_from_a_lent_worker_is_sent_again(rig: Rig) ->
     assert len(list(rig.deliveries())) == 2, "the second call was not sent again"
 
 
-def test_after_close_what_is_there_is_done_and_the_workers_leave(rig: Rig) -> None:
+def test_after_close_the_rest_is_done_and_the_workers_leave(rig: Rig) -> None:
     results = [rig.map(range(5)), rig.call()]
     rig.executor.close()
     with pytest.raises(ValueError, match="not running"):
@@ -444,7 +442,7 @@ def test_after_close_what_is_there_is_done_and_the_workers_leave(rig: Rig) -> No
     assert rig.executor.ended.is_set()
 
 
-def test_what_was_asked_for_at_the_moment_of_the_end_hears_of_it(rig: Rig) -> None:
+def test_a_request_at_the_moment_of_the_end_fails(rig: Rig) -> None:
     rig.loop.held = True
     error = RuntimeError("terminated")
     rig.executor.terminate(error)
@@ -459,7 +457,7 @@ def test_what_was_asked_for_at_the_moment_of_the_end_hears_of_it(rig: Rig) -> No
     rig.loop.held = False
 
 
-def test_terminate_fails_what_is_not_done(rig: Rig) -> None:
+def test_terminate_fails_unfinished_calls(rig: Rig) -> None:
     error = RuntimeError("terminated")
     found = [rig.map(range(100)), rig.call(), rig.call(timeout=60.0), Results()]
     stream = rig.executor.open_stream(rig.item(found[-1]))
@@ -471,7 +469,7 @@ def test_terminate_fails_what_is_not_done(rig: Rig) -> None:
     assert [child.signals[1:] for child in rig.children] == [[signal.SIGKILL]] * 2
 
 
-def test_nobody_waits_for_a_loop_that_has_failed() -> None:
+def test_waits_for_a_failed_loop_end() -> None:
     rig = Rig(2)
     found = [rig.map(range(100)), rig.call()]
     rig.executor.broken(FiberError("the loop has failed"))
@@ -482,7 +480,7 @@ def test_nobody_waits_for_a_loop_that_has_failed() -> None:
     assert [child.signals[-1:] for child in rig.children] == [[signal.SIGKILL]] * 2
 
 
-def test_nobody_waits_for_workers_of_a_pool_that_has_ended(
+def test_waits_for_workers_of_an_ended_pool_end(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     rig = Rig(2, ready=False)
@@ -493,7 +491,7 @@ def test_nobody_waits_for_workers_of_a_pool_that_has_ended(
     assert str(found.exception(PATIENCE)) == "Pool not running"
 
 
-def test_nobody_waits_for_workers_of_a_loop_that_has_failed(
+def test_waits_for_workers_of_a_failed_loop_end(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     rig = Rig(2, ready=False)

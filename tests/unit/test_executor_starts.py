@@ -94,7 +94,7 @@ def test_without_a_thread_to_start_them_workers_are_tried_again(rig: Rig) -> Non
 
 
 @pytest.mark.usefixtures("no_thread")
-def test_without_a_thread_to_say_it_bad_news_stop_nothing(
+def test_without_a_thread_for_them_reports_harm_no_work(
     rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(start_failures, "SAID_AFTER", -1.0)
@@ -112,7 +112,7 @@ def test_an_initializers_pickler_may_raise_anything() -> None:
     rig.close()
 
 
-def test_a_worker_that_is_not_ready_when_the_pool_is_closed_is_told_to_end() -> None:
+def test_a_worker_that_is_not_ready_when_the_pool_closes_is_stopped() -> None:
     rig = Rig(1, ready=False)
     rig.executor.close()
     assert rig.children[0].told_to_end
@@ -121,7 +121,7 @@ def test_a_worker_that_is_not_ready_when_the_pool_is_closed_is_told_to_end() -> 
     rig.close()
 
 
-def test_what_a_worker_complains_of_is_what_the_user_hears() -> None:
+def test_a_workers_complaint_is_the_users_error() -> None:
     rig = Rig(1, ready=False)
     results = rig.call()
     for _ in range(60):
@@ -141,7 +141,7 @@ def test_what_a_worker_complains_of_is_what_the_user_hears() -> None:
 @pytest.mark.parametrize(
     ("cause", "told"), [(Cause.CHILD, True), (Cause.REFUSED, True), (Cause.AGENT_LOST, False)]
 )
-def test_what_an_end_says_of_a_worker_is_told_by_its_cause_in_whatever_words(
+def test_the_end_of_a_worker_is_reported_by_its_cause(
     cause: Cause, told: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     failures: list[start_failures.StartFailure | None] = []
@@ -175,7 +175,7 @@ def test_a_pool_that_gives_up_kills_the_workers_that_do_not_end(
     rig.close()
 
 
-def test_of_a_call_that_was_tried_again_nothing_is_kept(rig: Rig) -> None:
+def test_a_call_that_was_tried_again_leaves_no_state(rig: Rig) -> None:
     results = rig.call()
     (handle,) = rig.busy
     rig.lose(handle, running=(rig.child(handle).packets[0][0], 0))

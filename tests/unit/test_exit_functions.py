@@ -66,7 +66,7 @@ def run_script(folder: Path, text: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_queue_of_multiprocessing_sends_what_it_holds(tmp_path: Path, method: str) -> None:
+def test_a_queue_of_multiprocessing_sends_its_items(tmp_path: Path, method: str) -> None:
     done = run_script(
         tmp_path,
         f"""
@@ -86,7 +86,7 @@ def test_a_queue_of_multiprocessing_sends_what_it_holds(tmp_path: Path, method: 
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_what_they_print_is_not_lost(tmp_path: Path, method: str) -> None:
+def test_output_of_exit_functions_is_not_lost(tmp_path: Path, method: str) -> None:
     done = run_script(
         tmp_path,
         f"""
@@ -103,7 +103,7 @@ def test_what_they_print_is_not_lost(tmp_path: Path, method: str) -> None:
     assert (done.stdout, done.stderr) == ("the end0\n", "")
 
 
-def test_what_the_main_module_registers_is_for_the_process_that_imports_it(tmp_path: Path) -> None:
+def test_exit_functions_of_the_main_module_belong_to_the_importing_process(tmp_path: Path) -> None:
     # Forked children share objects with their zygote, say a folder: none may remove it.
     done = run_script(
         tmp_path,

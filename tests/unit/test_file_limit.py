@@ -22,7 +22,7 @@ def attempt(function, *args):
 """
 
 
-def test_a_worker_that_may_write_none_works_and_says_what_it_cannot_send() -> None:
+def test_a_worker_that_may_write_no_file_works_and_reports_large_results() -> None:
     done = run_program(f"""{LIMIT}
 with fiber.Pool(1, limit, (0,)) as pool:
     attempt(pool.apply, len, (bytes(LARGE),))
@@ -33,7 +33,7 @@ with fiber.Pool(1, limit, (0,)) as pool:
     assert done.stdout == "1048576\nsending a message: 0\nsending a message: 0\n3\n", done.stderr
 
 
-def test_a_program_hears_what_it_cannot_send() -> None:
+def test_a_program_gets_an_error_for_an_argument_that_it_cannot_send() -> None:
     done = run_program(f"""{LIMIT}
 with fiber.Pool(1) as pool:
     limit(1 << 17)
@@ -47,7 +47,7 @@ with fiber.Pool(1) as pool:
     assert done.stdout == f"{refused}{refused}100000\n{refused}", done.stderr
 
 
-def test_a_program_whose_agents_cannot_start_hears_why_without_a_traceback() -> None:
+def test_a_program_whose_agents_cannot_start_gets_the_reason_without_a_traceback() -> None:
     done = run_program(
         f"""{LIMIT}
 limit(1 << 19)
@@ -64,7 +64,7 @@ except fiber.StartError as error:
     assert "Traceback" not in done.stderr
 
 
-def test_a_program_that_cannot_start_hears_why() -> None:
+def test_a_program_that_cannot_start_gets_the_reason() -> None:
     done = run_program(f"""{LIMIT}
 limit(1 << 10)
 attempt(fiber.Pool, 1)

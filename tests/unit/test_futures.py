@@ -96,7 +96,7 @@ def test_a_task_that_raises(executor: fiber.Executor) -> None:
     assert "in raise_value_error" in str(error.__cause__)
 
 
-def test_what_does_not_pickle_is_the_futures_error(executor: fiber.Executor) -> None:
+def test_an_argument_that_does_not_pickle_is_the_futures_error(executor: fiber.Executor) -> None:
     argument = executor.submit(tasks.identity, tasks.Unpicklable()).exception(PATIENCE)
     assert "cannot be pickled" in str(argument)
     result = executor.submit(tasks.odd_results, 2).exception(PATIENCE)
@@ -140,7 +140,7 @@ def test_a_coroutine_awaits_them(executor: Any, tmp_path: Path) -> None:
 # Cancelling
 
 
-def test_what_has_not_begun_can_be_cancelled_and_never_runs(tmp_path: Path) -> None:
+def test_a_waiting_call_can_be_cancelled_and_never_runs(tmp_path: Path) -> None:
     gate, log = tmp_path / "gate", tmp_path / "log"
     with fiber.Executor(1) as executor:
         running = executor.submit(tasks.wait_for, gate)
@@ -190,7 +190,7 @@ def test_for_cancelled_tasks_no_worker_is_waited_for(tmp_path: Path) -> None:
     executor.shutdown()
 
 
-def test_shutdown_can_cancel_what_has_not_begun(tmp_path: Path) -> None:
+def test_shutdown_can_cancel_waiting_calls(tmp_path: Path) -> None:
     gate = tmp_path / "gate"
     executor = fiber.Executor(1)
     first = executor.submit(tasks.wait_for, gate)
@@ -255,7 +255,7 @@ def test_map_reads_no_more_than_its_buffer(executor: fiber.Executor) -> None:
     results.close()
 
 
-def test_map_of_what_does_not_pickle(executor: fiber.Executor) -> None:
+def test_map_of_an_item_that_does_not_pickle(executor: fiber.Executor) -> None:
     results = executor.map(tasks.ExitingInMaster(), [1])
     with pytest.raises(BaseException, match=r".*"):
         next(results)
@@ -277,7 +277,7 @@ def test_map_refuses(executor: fiber.Executor, wrong: dict[str, int]) -> None:
 
 
 @pytest.mark.parametrize("wrong", [(5,), ([1], 5), (5, [1]), (None,)])
-def test_map_of_what_is_not_iterable_is_an_error_at_the_call(
+def test_map_of_a_value_that_is_not_iterable_fails_at_the_call(
     executor: fiber.Executor, wrong: tuple[Any, ...]
 ) -> None:
     with ThreadPoolExecutor(1) as other:
@@ -300,7 +300,7 @@ def test_a_task_that_kills_its_worker_runs_again_elsewhere(
     assert executor.submit(tasks.die_at_first, tmp_path / "log").result(PATIENCE) == "lived"
 
 
-def test_a_task_that_kills_every_worker_breaks_nothing_else(
+def test_a_task_that_kills_every_worker_breaks_no_other(
     executor: fiber.Executor, tmp_path: Path
 ) -> None:
     log = tmp_path / "log"
@@ -330,7 +330,7 @@ def test_an_initializer_that_raises_breaks_it() -> None:
         assert executor._broken
 
 
-def test_terminate_workers_tells_all_who_wait(tmp_path: Path) -> None:
+def test_terminate_workers_ends_all_waits(tmp_path: Path) -> None:
     executor = fiber.Executor(1)
     called = threading.Event()
     pending = [executor.submit(tasks.announce_and_sleep, tmp_path / "a") for _ in range(3)]
@@ -348,7 +348,7 @@ def test_terminate_workers_tells_all_who_wait(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_options_are_those_of_what_is_submitted_through_them(
+def test_options_apply_to_calls_that_are_submitted_through_them(
     executor: fiber.Executor, tmp_path: Path
 ) -> None:
     hurried = executor.options(timeout=0.2, retries=0)
@@ -363,7 +363,7 @@ def test_options_are_those_of_what_is_submitted_through_them(
         executor.submit(tasks.square, 1)
 
 
-def test_options_that_are_dropped_leave_nothing_in_the_engine(executor: fiber.Executor) -> None:
+def test_dropped_options_leave_no_state_in_the_engine(executor: fiber.Executor) -> None:
     executor.submit(tasks.square, 1).result(PATIENCE)
     (engine,) = executor._group.executors()
     before = len(engine._ledger.jobs)
@@ -436,7 +436,7 @@ def test_a_task_that_comes_while_it_is_shut_down(
     assert not other._group.executors()
 
 
-def test_ctrl_c_while_it_starts_leaves_nothing() -> None:
+def test_ctrl_c_during_the_start_leaves_no_worker() -> None:
     made: list[fiber.Executor] = []
 
     def start() -> None:
@@ -483,7 +483,7 @@ def test_the_program_ends_after_its_tasks() -> None:
     assert done.stderr == ""
 
 
-def test_nothing_is_taken_once_the_program_ends() -> None:
+def test_calls_are_refused_once_the_program_ends() -> None:
     done = run_program(
         """
         import atexit
@@ -524,7 +524,7 @@ def test_it_cannot_be_sent(executor: fiber.Executor) -> None:
         pickle.dumps(executor)
 
 
-def test_ctrl_c_in_a_with_block_cancels_what_has_not_begun(tmp_path: Path) -> None:
+def test_ctrl_c_in_a_with_block_cancels_waiting_calls(tmp_path: Path) -> None:
     pending: list[futures.Future[str]] = []
 
     def work() -> None:

@@ -64,7 +64,7 @@ NUMBERS = [NO_SECRET, *(number.to_bytes(16, "little") for number in range(1, 6))
 
 @pytest.mark.parametrize("guess", [*NUMBERS, "the identity"])
 @pytest.mark.parametrize("as_grant", [False, True])
-def test_what_others_have_cannot_be_had_by_guessing(
+def test_objects_of_others_cannot_be_used_by_guessing(
     others: RemoteChannel, stream: HubStream, guess: bytes | str, as_grant: bool
 ) -> None:
     tried = others.identity if isinstance(guess, str) else guess
@@ -75,7 +75,7 @@ def test_what_others_have_cannot_be_had_by_guessing(
 
 
 @pytest.mark.parametrize("guess", [*NUMBERS, "the identity"])
-def test_what_others_have_cannot_be_passed_on(
+def test_objects_of_others_cannot_be_passed_on(
     others: RemoteChannel, stream: HubStream, guess: bytes | str
 ) -> None:
     tried = others.identity if isinstance(guess, str) else guess
@@ -132,7 +132,7 @@ def test_a_token_stands_for_one_object(far: Far, home: HubAddress, hosts: Hosts)
     stream.close()
 
 
-def test_what_was_handed_on_is_used_by_all_and_passed_on_again(far: Far, hosts: Hosts) -> None:
+def test_a_received_object_is_used_by_all_and_passed_on_again(far: Far, hosts: Hosts) -> None:
     here, there = fiber.Pipe()
     ends = [far(there)]
     for _ in range(3):

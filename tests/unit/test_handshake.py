@@ -34,7 +34,7 @@ def test_there_and_back(greeting: AgentHello | MasterWelcome | MasterRefusal) ->
     assert decode_greeting(greeting.encode()) == greeting
 
 
-def test_a_hello_of_another_protocol_still_says_who_it_is() -> None:
+def test_a_hello_of_another_protocol_still_names_its_sender() -> None:
     strange = {"identity": {**vars(OURS), "protocol": 99, "facts": {}}, "ticket": "whatever"}
     hello = decode_greeting(b"\x10" + json.dumps(strange).encode())
     assert hello.identity == replace(OURS, protocol=99, facts={})
@@ -64,13 +64,13 @@ def test_a_hello_of_another_protocol_still_says_who_it_is() -> None:
         ),
     ],
 )
-def test_what_is_no_greeting_is_named(datagram: bytes, complaint: str) -> None:
+def test_an_invalid_greeting_is_named(datagram: bytes, complaint: str) -> None:
     with pytest.raises(ProtocolError, match=complaint):
         decode_greeting(datagram)
 
 
 @given(st.sampled_from([0x10, 0x11, 0x12, 0x13]), st.binary(max_size=50))
-def test_noise_raises_nothing_but_protocol_error(kind: int, noise: bytes) -> None:
+def test_noise_raises_only_protocol_error(kind: int, noise: bytes) -> None:
     try:
         decode_greeting(bytes([kind]) + noise)
     except ProtocolError:
@@ -100,7 +100,7 @@ def test_versions_must_fit(theirs: Identity, complaint: str | None) -> None:
     assert complaint is None or str(error).startswith(complaint)
 
 
-def test_this_process_says_what_it_is() -> None:
+def test_this_process_names_its_versions() -> None:
     identity = Identity.of_this_process("agent-1", host="here")
     assert identity.protocol == PROTOCOL
     assert identity.facts == {"host": "here"}

@@ -143,7 +143,7 @@ def test_a_hub_hands_the_memory_to_processes_of_its_host_and_not_to_others() -> 
         hosts.close()
 
 
-def test_the_doorbell_is_heard_at_the_hub() -> None:
+def test_the_hub_gets_the_doorbell() -> None:
     hosts = Hosts()
     heard: Queue[None] = Queue()
     try:

@@ -96,7 +96,7 @@ def test_grants_collected_in_vain_are_released(hosts: Hosts) -> None:
         assert objects_kept(hub) == 0
 
 
-def test_nothing_collected_is_nothing_to_release(hosts: Hosts) -> None:
+def test_an_empty_collection_releases_no_grants(hosts: Hosts) -> None:
     with hosts.at("a"), collecting_grants() as collected:
         pickle.dumps([1, 2, 3])
     assert not collected
@@ -113,7 +113,7 @@ def test_a_pickling_that_was_interrupted_before_it_could_end_is_forgotten(hosts:
         one.close()
 
 
-def test_picklings_of_what_has_no_handles_are_forgotten() -> None:
+def test_picklings_without_handles_are_forgotten() -> None:
     for number in range(100):
         reduction.encode_reusable(number)
     assert len(handles._this_thread.picklings) <= 1
@@ -177,7 +177,7 @@ def test_everything_shared_travels(hosts: Hosts) -> None:
         assert repr(copies[5]) == "<BoundedSemaphore(value=2, maxvalue=2)>"
 
 
-def test_without_a_hub_the_error_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_hub_the_error_names_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("_local_hub", "_address", "_starter"):
         monkeypatch.setattr(client, name, None)
     for shared in (fiber.Pipe()[1], fiber.SimpleQueue()):
@@ -209,7 +209,7 @@ def test_the_socket_is_private_and_goes_with_the_hub(hosts: Hosts) -> None:
     assert wait_until(lambda: not os.path.exists(directory), PATIENCE)
 
 
-def test_a_path_that_is_too_long_says_what_to_set(tmp_path: Path, hosts: Hosts) -> None:
+def test_a_path_that_is_too_long_names_the_setting(tmp_path: Path, hosts: Hosts) -> None:
     from fiber._hub.hub import Hub
 
     deep = tmp_path / ("d" * 100)
@@ -270,7 +270,7 @@ def test_a_stranger_is_shown_out(hosts: Hosts, greeting: bytes) -> None:
     assert objects_kept(hub) == 1
 
 
-def test_nothing_of_a_stranger_is_unpickled(hosts: Hosts, tmp_path: Path) -> None:
+def test_bytes_of_a_stranger_are_not_unpickled(hosts: Hosts, tmp_path: Path) -> None:
     hub = hosts["a"]
     mark = tmp_path / "unpickled"
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as stranger:
@@ -379,7 +379,7 @@ def test_a_child_borrows(hosts: Hosts, child: Connection) -> None:
         assert objects_kept(hub) == 0
 
 
-def test_a_child_lends_and_what_it_lent_outlives_it(hosts: Hosts, child: Connection) -> None:
+def test_objects_that_a_child_shares_outlive_it(hosts: Hosts, child: Connection) -> None:
     with hosts.at("a"):
         child.send("lend")
         data = child.recv_bytes()
@@ -411,7 +411,7 @@ def collect_and_die(own: HubAddress, results: Connection) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def test_what_a_dead_process_had_collected_is_released(hosts: Hosts) -> None:
+def test_collected_grants_of_a_dead_process_are_released(hosts: Hosts) -> None:
     hub = hosts["a"]
     ours, theirs = fiber.Pipe()
     process = start(collect_and_die, hub.address, theirs)
@@ -427,7 +427,7 @@ def test_what_a_dead_process_had_collected_is_released(hosts: Hosts) -> None:
     ours.close()
 
 
-def test_a_child_takes_back_what_it_collected(hosts: Hosts) -> None:
+def test_a_child_takes_back_its_collected_grants(hosts: Hosts) -> None:
     with hosts.child_at("a") as hub:
         _, end = fiber.Pipe()
         with collecting_grants() as collected:
@@ -438,7 +438,7 @@ def test_a_child_takes_back_what_it_collected(hosts: Hosts) -> None:
         assert wait_until(lambda: objects_kept(hub) == 0, PATIENCE)
 
 
-def test_a_child_takes_back_what_it_could_not_pickle(hosts: Hosts) -> None:
+def test_a_child_takes_back_grants_of_a_failed_pickling(hosts: Hosts) -> None:
     with hosts.child_at("a") as hub:
         _, end = fiber.Pipe()
         pickling = handles.begin_pickling()

@@ -67,7 +67,7 @@ def test_large_messages_and_arrays_pass(far_pipe: tuple[Connection, Connection])
             assert copy.flags.writeable
 
 
-def test_what_is_sent_unconfirmed_keeps_its_place(far_pipe: tuple[Connection, Connection]) -> None:
+def test_an_unconfirmed_message_keeps_its_place(far_pipe: tuple[Connection, Connection]) -> None:
     here, there = far_pipe
     there.send("first")
     there._send_unconfirmed("second")
@@ -79,7 +79,7 @@ def test_what_is_sent_unconfirmed_keeps_its_place(far_pipe: tuple[Connection, Co
     sender.join()
 
 
-def test_the_next_one_says_that_what_was_sent_unconfirmed_was_not(
+def test_the_next_send_reports_the_loss_of_an_unconfirmed_message(
     far_pipe: tuple[Connection, Connection],
 ) -> None:
     here, there = far_pipe
@@ -145,14 +145,14 @@ def test_the_end_comes_when_the_far_holder_closes(far_pipe: tuple[Connection, Co
         there.recv()
 
 
-def test_sending_to_nobody_fails(far_pipe: tuple[Connection, Connection]) -> None:
+def test_sending_without_a_receiver_fails(far_pipe: tuple[Connection, Connection]) -> None:
     here, there = far_pipe
     here.close()
     with pytest.raises(BrokenPipeError):
         there.send(1)
 
 
-def test_a_blocked_receiver_hears_of_the_end(far_pipe: tuple[Connection, Connection]) -> None:
+def test_a_blocked_receiver_gets_the_end(far_pipe: tuple[Connection, Connection]) -> None:
     here, there = far_pipe
     ends: list[type[BaseException]] = []
 
@@ -200,7 +200,7 @@ def test_threads_that_wait_do_not_wait_for_each_other(far: Far) -> None:
     remote.close()
 
 
-def test_it_comes_home_as_what_it_was(hosts: Hosts, far: Far) -> None:
+def test_an_object_comes_home_as_itself(hosts: Hosts, far: Far) -> None:
     _, there = fiber.Pipe()
     remote = far(there)
     data = pickle.dumps(remote)
@@ -231,7 +231,7 @@ def test_collected_handles_of_far_objects_outlive_them(hosts: Hosts, far: Far) -
         here.recv()
 
 
-def test_an_unused_handle_that_is_forgotten_holds_nothing(hosts: Hosts, far: Far) -> None:
+def test_a_forgotten_unused_handle_holds_no_object(hosts: Hosts, far: Far) -> None:
     _, there = fiber.Pipe()
     remote = far(there)
     del remote
@@ -299,7 +299,7 @@ def test_a_kept_descriptor_stays_right(far_pipe: tuple[Connection, Connection]) 
         assert there.recv() == number
 
 
-def test_what_another_receives_is_not_announced(far: Far) -> None:
+def test_a_message_for_another_receiver_is_not_announced(far: Far) -> None:
     here, there = fiber.Pipe()
     remote = far(there)
     assert wait([remote], 0) == []

@@ -71,7 +71,7 @@ def use_queue_from_afar(own: HubAddress, data: bytes, put: bool, report: Connect
 
 
 @pytest.mark.parametrize("put", [True, False])
-def test_who_dies_before_it_hears_what_it_got_takes_no_place(
+def test_a_receiver_that_dies_before_its_answer_takes_no_place(
     put: bool, hosts: Hosts, far: Far, wires: tuple[Wire, Wire]
 ) -> None:
     queue: Any = fiber.Queue(1)
@@ -110,7 +110,7 @@ def test_who_dies_before_it_hears_what_it_got_takes_no_place(
     theirs.close()
 
 
-def test_what_an_interrupted_take_did_not_get_is_not_given_back(
+def test_an_interrupted_take_gives_back_only_its_tokens(
     far: Far, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupted(*arguments: Any) -> None:
@@ -125,7 +125,7 @@ def test_what_an_interrupted_take_did_not_get_is_not_given_back(
     remote.close()
 
 
-def test_a_far_receiver_killed_while_waiting_takes_nothing(
+def test_a_remote_receiver_killed_while_waiting_takes_no_message(
     hosts: Hosts, lost_soul: Callable[..., Any]
 ) -> None:
     here, there = fiber.Pipe()
@@ -193,7 +193,7 @@ def test_a_lost_link_ends_every_wait_with_its_reason(hosts: Hosts, far: Far) -> 
     remote.close()
 
 
-def test_a_host_that_nobody_knows_is_named(hosts: Hosts) -> None:
+def test_an_unknown_host_is_named(hosts: Hosts) -> None:
     here, there = fiber.Pipe()
     with hosts.at("elsewhere"):
         data = pickle.dumps(there)
@@ -226,7 +226,7 @@ def interruptible() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("interruptible")
-def test_an_interrupted_receive_loses_nothing(
+def test_an_interrupted_receive_loses_no_message(
     hosts: Hosts, far_pipe: tuple[Connection, Connection]
 ) -> None:
     here, there = far_pipe
@@ -242,7 +242,7 @@ def test_an_interrupted_receive_loses_nothing(
 
 
 @pytest.mark.usefixtures("interruptible")
-def test_what_was_on_its_way_to_an_interrupted_receive_is_kept(
+def test_a_message_on_its_way_to_an_interrupted_receive_is_kept(
     far_pipe: tuple[Connection, Connection], wires: tuple[Wire, Wire]
 ) -> None:
     here, there = far_pipe
@@ -262,7 +262,7 @@ def test_what_was_on_its_way_to_an_interrupted_receive_is_kept(
 
 
 @pytest.mark.usefixtures("interruptible")
-def test_an_interrupted_acquire_takes_nothing(far: Far, wires: tuple[Wire, Wire]) -> None:
+def test_an_interrupted_acquire_takes_no_token(far: Far, wires: tuple[Wire, Wire]) -> None:
     semaphore = fiber.Semaphore(0)
     remote = far(semaphore)
     _, down = wires
@@ -284,7 +284,7 @@ def send_from_a_fork(remote: Connection) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork:DeprecationWarning")
-def test_a_process_forked_by_multiprocessing_has_streams_of_its_own(
+def test_a_process_forked_by_multiprocessing_has_separate_streams(
     hosts: Hosts, wires: tuple[Wire, Wire]
 ) -> None:
     here, there = fiber.Pipe()
@@ -305,7 +305,7 @@ def test_a_process_forked_by_multiprocessing_has_streams_of_its_own(
         remote.close()
 
 
-def test_a_queue_whose_host_is_gone_holds_nobody(hosts: Hosts, far: Far) -> None:
+def test_a_queue_whose_host_is_gone_blocks_no_caller(hosts: Hosts, far: Far) -> None:
     queue: Any = fiber.Queue()
     remote: Any = far(queue)
     remote.put(1)

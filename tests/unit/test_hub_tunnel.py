@@ -173,7 +173,7 @@ def test_other_tunnels_go_on_beside_a_congested_one() -> None:
 
 
 @pytest.mark.parametrize("reason", ["", "it is over"])
-def test_the_end_comes_after_what_was_sent_and_with_its_reason(reason: str) -> None:
+def test_the_end_comes_after_earlier_messages_and_with_its_reason(reason: str) -> None:
     pair = Pair()
     ours, theirs, listener = pair.open()
     theirs.pause()
@@ -190,7 +190,7 @@ def test_the_end_comes_after_what_was_sent_and_with_its_reason(reason: str) -> N
     assert len(pair.agent._streams) == len(pair.master._streams) == 0
 
 
-def test_what_came_before_the_end_is_heard_although_paused() -> None:
+def test_messages_before_the_end_arrive_although_paused() -> None:
     pair = Pair()
     ours, theirs, listener = pair.open()
     theirs.pause()

@@ -103,14 +103,14 @@ def test_each_grant_brings_it_to_the_bound_and_none_comes_before_half_is_gone() 
     assert reading.stream._granted == 3 * AHEAD
 
 
-def test_it_reads_ahead_more_of_what_is_quick() -> None:
+def test_it_reads_ahead_further_for_quick_tasks() -> None:
     slow, quick = Reading(), Reading()
     slow.grant()
     quick.grant(pace=known(1e-5))
     assert quick.stream._granted > 10 * slow.stream._granted
 
 
-def test_units_are_not_torn_but_for_the_last() -> None:
+def test_only_the_last_unit_may_be_incomplete() -> None:
     reading = Reading(unit=4)
     reading.grant(workers=4)
     taken: list[list[int]] = []
@@ -125,13 +125,13 @@ def test_units_are_not_torn_but_for_the_last() -> None:
     assert reading.stream.take() == [8, 9]
 
 
-def test_what_is_granted_is_whole_units() -> None:
+def test_grants_are_whole_units() -> None:
     reading = Reading(unit=4, limit=7)
     reading.grant(workers=4)
     assert reading.stream._granted == 4
 
 
-def test_who_waits_for_input_is_notified_once() -> None:
+def test_a_reader_that_waits_for_input_is_notified_once() -> None:
     reading = Reading()
     reading.grant(workers=10)
 
@@ -156,7 +156,7 @@ def test_input_that_comes_before_it_is_awaited_is_taken() -> None:
     assert reading.stream.take() == [1]
 
 
-def test_what_the_iterable_raises_is_raised_and_what_came_before_is_kept() -> None:
+def test_an_exception_of_the_iterable_comes_after_the_earlier_items() -> None:
     reading = Reading()
     reading.grant()
 
@@ -169,7 +169,7 @@ def test_what_the_iterable_raises_is_raised_and_what_came_before_is_kept() -> No
     assert reading.stream.take() == [1]
 
 
-def test_what_is_no_iterable_is_refused_before_anything_is_waited_for() -> None:
+def test_a_value_that_is_not_iterable_is_refused_at_once() -> None:
     with pytest.raises(TypeError):
         Reading().stream.read(3)  # type: ignore[arg-type]
 
@@ -198,7 +198,7 @@ def test_a_reader_ends_with_the_stream_before_it_has_used_its_credit() -> None:
     assert reading.read == [1, 2]
 
 
-def test_nothing_is_granted_after_the_end() -> None:
+def test_the_end_stops_grants() -> None:
     reading = Reading()
     reading.stream.end()
     reading.grant()
@@ -225,7 +225,7 @@ def test_no_more_is_read_than_the_limit_allows_until_it_is_consumed() -> None:
     assert reading.stream._granted == 4
 
 
-def test_consuming_is_not_told_to_who_does_not_wait_for_it() -> None:
+def test_consumption_is_reported_only_to_a_waiting_reader() -> None:
     reading = Reading(limit=2)
     reading.consume()
     reading.grant()
@@ -234,7 +234,7 @@ def test_consuming_is_not_told_to_who_does_not_wait_for_it() -> None:
 
 
 @pytest.mark.parametrize("counted", [True, False])
-def test_what_is_consumed_while_room_is_counted_is_counted_or_told(
+def test_consumption_during_the_count_is_counted_or_reported(
     counted: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     reading = Reading(limit=1)
@@ -265,7 +265,7 @@ def test_a_limit_below_a_unit_lets_one_through() -> None:
     assert reading.stream._granted == 4
 
 
-def test_who_waits_for_the_end_lifts_the_limit() -> None:
+def test_a_wait_for_the_end_lifts_the_limit() -> None:
     reading = Reading(limit=1)
     reading.grant(workers=2)
     reading.stream.lift_limit()

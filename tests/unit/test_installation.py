@@ -29,7 +29,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.Path:
     return zipfile.Path(built)
 
 
-def test_the_wheel_holds_what_a_program_needs(wheel: zipfile.Path) -> None:
+def test_the_wheel_holds_the_files_of_a_program(wheel: zipfile.Path) -> None:
     (info,) = (each.name for each in wheel.iterdir() if each.name.endswith(".dist-info"))
     assert {each.name for each in wheel.iterdir()} == {"fiber", "fiber_api", info}
     assert wheel.joinpath("fiber", "py.typed").exists()
@@ -64,7 +64,7 @@ def test_links_of_the_readme_lead_somewhere_from_a_package_index(wheel: zipfile.
         ("joblib", "import fiber.joblib", r"fiber\.joblib .*'fiberpool\[joblib\]'"),
     ],
 )
-def test_a_missing_package_is_named_with_what_installs_it(
+def test_a_missing_package_is_named_with_its_extra(
     package: str, statement: str, advice: str
 ) -> None:
     program = (
@@ -76,7 +76,7 @@ def test_a_missing_package_is_named_with_what_installs_it(
     assert re.search(advice, last)
 
 
-def test_another_missing_module_is_told_as_it_is() -> None:
+def test_another_missing_module_is_reported_unchanged() -> None:
     with (
         pytest.raises(ModuleNotFoundError, match=r"^No module named 'no_such_module'$"),
         _installation.explained_if_missing("fiber.vector"),
@@ -84,7 +84,7 @@ def test_another_missing_module_is_told_as_it_is() -> None:
         import no_such_module  # noqa: F401
 
 
-def test_extras_have_what_they_are_said_to_have() -> None:
+def test_extras_match_their_documentation() -> None:
     for package, argument in _installation._INSTALLED_BY.items():
         if extra := re.fullmatch(r"'fiberpool\[(\w+)\]'", argument):
             requirements = PROJECT["optional-dependencies"][extra[1]]
@@ -139,7 +139,7 @@ def test_a_package_that_was_overwritten_says_so(site: Path) -> None:
     assert "pip uninstall fiber, and then pip install --force-reinstall fiberpool" in printed
 
 
-def test_the_pool_is_shown_as_what_it_is() -> None:
+def test_pool_is_shown_as_a_method_of_its_context() -> None:
     assert repr(fiber.Pool) == "<bound method BaseContext.Pool of fiber>"
     spawn = fiber.get_context("spawn")
     assert repr(spawn.Pool) == "<bound method BaseContext.Pool of fiber.get_context('spawn')>"

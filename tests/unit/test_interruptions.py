@@ -82,7 +82,7 @@ def test_a_put_within_a_put_of_the_same_queue(monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.mark.slow
 @pytest.mark.parametrize("before", [0, MORE_THAN_FITS], ids=["direct", "fed"])
-def test_ctrl_c_at_any_line_of_a_put_leaves_a_queue_that_works(before: int) -> None:
+def test_ctrl_c_at_any_line_of_a_put_leaves_a_working_queue(before: int) -> None:
     files = {queues.__file__, queue_delivery.__file__}
 
     def put_and_drain(stop: int) -> bool:
@@ -134,7 +134,7 @@ def test_ctrl_c_at_any_step_of_a_put_costs_no_place_and_no_join(
     assert steps > 10, "it was hardly interrupted"
 
 
-def test_ctrl_c_at_any_step_of_acquire_costs_nobody_a_semaphore() -> None:
+def test_ctrl_c_at_any_step_of_acquire_loses_no_token() -> None:
     steps = 0
     while True:
         semaphore = fiber.Semaphore(1)
@@ -224,7 +224,7 @@ def test_a_finalizer_at_any_line_of_the_hub_may_share(hosts: Hosts) -> None:
         here.close()
 
 
-def test_who_waits_for_a_hub_that_ends_is_told(
+def test_waits_for_a_hub_that_ends_get_the_error(
     hosts: Hosts, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with hosts.at("a") as hub_a:
@@ -326,7 +326,7 @@ def test_sharing_within_sharing_in_a_child(hosts: Hosts, monkeypatch: pytest.Mon
         assert pickle.loads(outer).recv() == "through"
 
 
-def test_what_was_sent_within_a_pickling_that_failed_stays_sent(hosts: Hosts) -> None:
+def test_messages_sent_within_a_failed_pickling_stay_sent(hosts: Hosts) -> None:
     with hosts.at("a"):
         carrier, reader = fiber.Pipe()
         here, there = fiber.Pipe()
@@ -347,7 +347,7 @@ def test_what_was_sent_within_a_pickling_that_failed_stays_sent(hosts: Hosts) ->
             end.close()
 
 
-def test_a_task_is_reusable_whatever_was_sent_while_it_was_pickled(hosts: Hosts) -> None:
+def test_a_task_is_reusable_after_messages_sent_during_its_pickling(hosts: Hosts) -> None:
     with hosts.at("a"):
         carrier, reader = fiber.Pipe()
         unused, there = fiber.Pipe()
@@ -394,7 +394,7 @@ def test_receiving_within_receiving_from_a_far_pipe(
     assert sorted(got) == [1, 2]
 
 
-def test_a_far_pipe_is_there_whatever_interrupts_its_use(
+def test_a_remote_pipe_survives_interruptions(
     far_pipe: tuple[Connection, Connection],
 ) -> None:
     here, far = far_pipe
@@ -436,7 +436,7 @@ def descriptors() -> int:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS.keys())
-def test_whatever_interrupts_making_or_dropping_something_no_descriptor_is_left(
+def test_an_interrupted_construction_or_release_leaves_no_descriptor(
     make: Callable[[], Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys, "unraisablehook", lambda _: None)  # what strikes in a finalizer
@@ -453,7 +453,7 @@ def test_whatever_interrupts_making_or_dropping_something_no_descriptor_is_left(
 
 
 @pytest.mark.parametrize("kind", [QuietSocket, GrantSet, Wakeup, IMapIterator])
-def test_what_was_interrupted_as_it_was_made_ends_in_silence(
+def test_an_object_whose_construction_was_interrupted_ends_silently(
     kind: type, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told: list[Any] = []
@@ -462,7 +462,7 @@ def test_what_was_interrupted_as_it_was_made_ends_in_silence(
     assert told == []
 
 
-def test_whatever_interrupts_a_start_no_descriptor_that_it_passes_is_left(
+def test_an_interrupted_start_leaves_no_passed_descriptor(
     pipe: tuple[Connection, Connection], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     site = state.runtime()
@@ -491,7 +491,7 @@ def test_whatever_interrupts_a_start_no_descriptor_that_it_passes_is_left(
 
 
 @pytest.mark.parametrize("side", ["send", "receive"])
-def test_whatever_interrupts_a_large_message_none_is_damaged_and_no_descriptor_left(
+def test_an_interrupted_large_message_is_undamaged_and_leaves_no_descriptor(
     side: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     files = {packet.__file__, memory_files.__file__, descriptor.__file__}

@@ -244,7 +244,7 @@ def test_writing_to_arrays_is_as_the_mode_says() -> None:
 
 
 @pytest.mark.parametrize("max_nbytes", ["1M", None])
-def test_what_is_mapped_already_is_mapped(max_nbytes: Any, tmp_path: Path) -> None:
+def test_a_mapped_array_is_mapped_in_the_worker(max_nbytes: Any, tmp_path: Path) -> None:
     mapped = np.memmap(tmp_path / "array", mode="w+", shape=100)
     parallel = joblib.Parallel(2, backend="fiber", max_nbytes=max_nbytes)
     parallel(call(np.ndarray.fill)(half, 1) for half in np.split(mapped, 2))

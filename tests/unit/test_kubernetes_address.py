@@ -48,7 +48,7 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> Cluster:
     return made
 
 
-def test_what_is_configured_wins(cluster: Cluster) -> None:
+def test_the_configured_address_wins(cluster: Cluster) -> None:
     assert cluster.found("192.168.1.5") == "192.168.1.5"
     assert cluster.asked == 0
 
@@ -61,7 +61,7 @@ def test_a_configured_name_becomes_the_address_that_a_pool_takes(
     assert cluster.found("laptop.example") == "192.168.1.5"
 
 
-def test_a_configured_name_that_nobody_has(
+def test_a_configured_name_without_an_address_is_an_error(
     cluster: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(socket, "getaddrinfo", nobody)
@@ -121,6 +121,6 @@ def test_the_way_to_this_machine_is_a_loopback() -> None:
     assert provisioner._local_address("127.0.0.1") == "127.0.0.1"
 
 
-def test_there_is_no_way_to_a_name_that_nobody_has(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_there_is_no_route_to_an_unknown_name(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(socket, "getaddrinfo", nobody)
     assert provisioner._local_address("nobody") is None

@@ -122,7 +122,7 @@ def test_without_a_package_it_says_how_to_install_it(
         Api.connect()
 
 
-def test_the_package_is_imported_by_whoever_connects_alone() -> None:
+def test_only_a_connection_imports_the_package() -> None:
     program = (
         "import sys, fiber._backends.kubernetes.fiber_pool, fiber._backends.kubernetes.provisioner;"
         "print([name for name in ('kubernetes', 'urllib3') if name in sys.modules])"
@@ -272,7 +272,7 @@ def test_an_account_whose_token_is_gone_is_unauthorized(
         api.list(ALL)
 
 
-def test_a_pod_without_an_account_says_what_to_do(account: tuple[Served, Path]) -> None:
+def test_a_pod_without_an_account_gets_the_remedy(account: tuple[Served, Path]) -> None:
     _, folder = account
     (folder / "namespace").unlink()
     with pytest.raises(ConfigError, match="automountServiceAccountToken"):
@@ -320,7 +320,7 @@ def test_objects_are_made_read_changed_and_deleted(server: Served, api: Api) -> 
     ("status", "kind"),
     [(401, Unauthorized), (403, Forbidden), (404, NotFound), (409, Conflict), (422, Invalid)],
 )
-def test_what_will_not_pass_is_raised_at_once(
+def test_permanent_errors_are_raised_at_once(
     server: Served, api: Api, status: int, kind: type[ApiError]
 ) -> None:
     server.api.faults.append(Fault("list", "pods", status=status, message="why", times=99))
@@ -340,7 +340,7 @@ def test_what_will_not_pass_is_raised_at_once(
         Fault(text="<html>"),
     ],
 )
-def test_what_may_pass_is_tried_again(server: Served, api: Api, fault: Fault) -> None:
+def test_transient_errors_are_tried_again(server: Served, api: Api, fault: Fault) -> None:
     fault.verb, fault.times = "list", 2
     server.api.faults.append(fault)
     assert api.list(ALL)["items"] == []
@@ -354,9 +354,7 @@ def test_with_timeout_0_there_is_one_attempt(server: Served, api: Api) -> None:
     assert server.api.count("list", "pods") == 1
 
 
-def test_who_is_asked_to_come_back_later_than_there_is_time_does_not_wait(
-    server: Served, api: Api
-) -> None:
+def test_a_retry_after_beyond_the_deadline_is_not_waited_for(server: Served, api: Api) -> None:
     server.api.faults.append(Fault(status=429, retry_after=20, times=9))
     pauses = Pauses()
     with pytest.raises(TooManyRequests) as caught:
@@ -378,7 +376,7 @@ class Pauses(threading.Event):
 
 
 @pytest.mark.parametrize("status", [429, 503])
-def test_who_is_asked_to_come_back_later_does(server: Served, api: Api, status: int) -> None:
+def test_a_retry_after_is_respected(server: Served, api: Api, status: int) -> None:
     server.api.faults.append(Fault(status=status, retry_after=3))
     pauses = Pauses()
     api.list(ALL, cancel=pauses)
@@ -397,7 +395,7 @@ def test_who_is_asked_to_come_back_later_does(server: Served, api: Api, status: 
         (Fault(status=302, text=""), ServerUnreachable, "Unreachable", "HTTP status 302"),
     ],
 )
-def test_whoever_answers_is_not_out_of_reach(
+def test_a_server_that_answers_is_reachable(
     server: Served, api: Api, fault: Fault, kind: type[Transient], reason: str, said: str
 ) -> None:
     fault.times = 99
@@ -431,7 +429,7 @@ def test_attempts_end_when_they_are_cancelled(server: Served, api: Api) -> None:
     assert server.api.count("list", "pods") == 1
 
 
-def test_nobody_who_answers_is_unreachable(api: Api, server: Served) -> None:
+def test_no_answering_server_is_unreachable(api: Api, server: Served) -> None:
     server.api.down = True
     with pytest.raises(ServerUnreachable):
         api.list(ALL, timeout=0.0)
@@ -485,7 +483,7 @@ def _watch_and_stop(api: Api) -> None:
     assert seen == ["ADDED"]
 
 
-def test_a_watch_that_was_stopped_before_brings_nothing(server: Served, api: Api) -> None:
+def test_a_watch_that_was_stopped_before_brings_no_event(server: Served, api: Api) -> None:
     version = api.list(ALL)["metadata"]["resourceVersion"]
     api.create(ALL, POD)
     watch = api.watch(ALL, {}, version)

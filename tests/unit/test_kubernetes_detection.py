@@ -106,7 +106,7 @@ def test_every_other_pod_runs_its_processes_itself(
 
 
 @pytest.mark.parametrize("backend", ["local", "loopback"])
-def test_who_chose_a_backend_is_not_looked_at(
+def test_a_chosen_backend_skips_the_detection(
     backend: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     account = in_a_pod(monkeypatch, ALLOWED)
@@ -114,7 +114,7 @@ def test_who_chose_a_backend_is_not_looked_at(
     assert account.asked == []
 
 
-def test_outside_of_pods_nobody_is_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_outside_of_pods_no_server_is_asked(monkeypatch: pytest.MonkeyPatch) -> None:
     account = in_a_pod(monkeypatch, ALLOWED)
     monkeypatch.delenv("KUBERNETES_SERVICE_HOST")
     assert not _is_on_cluster(Config())
@@ -172,7 +172,7 @@ def test_an_operator_of_this_namespace_alone_is_found(
     ],
     ids=["none", "elsewhere", "dead", "dead-here", "empty", "damaged", "no-right", "no-answer"],
 )
-def test_without_a_fresh_lease_processes_run_here_and_one_line_says_why(
+def test_without_a_fresh_lease_processes_run_here_and_one_line_explains_it(
     leases: dict[str, dict[str, Any] | Exception],
     says: str,
     monkeypatch: pytest.MonkeyPatch,

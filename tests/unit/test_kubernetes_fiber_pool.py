@@ -88,7 +88,7 @@ def test_a_pool_is_born_with_its_master_and_without_pods(rig: Rig, told: Told) -
     ]
 
 
-def test_what_belongs_to_a_pool_goes_with_it(rig: Rig, told: Told) -> None:
+def test_objects_of_a_pool_are_deleted_with_it(rig: Rig, told: Told) -> None:
     rig.own(told).demand(1)
     replicas_become(rig, told, 1)
     uid = rig.pool()["metadata"]["uid"]
@@ -132,9 +132,7 @@ def test_a_lease_that_was_there_before_is_not_taken_for_the_pools(rig: Rig, told
 
 
 @pytest.mark.parametrize("there", [True, False], ids=["anothers", "own"])
-def test_a_secret_of_which_the_maker_is_unknown_is_not_used(
-    rig: Rig, told: Told, there: bool
-) -> None:
+def test_a_secret_of_an_unknown_maker_is_not_used(rig: Rig, told: Told, there: bool) -> None:
     """An attempt has no answer, and fiber-user may not read whose Secret is there then."""
     rig.server.api.allows = FiberUser(NAMESPACE).allow
     name = names.secret_name("es-1")
@@ -182,7 +180,7 @@ def test_another_pool_is_not_deleted_after_attempts_without_an_answer(rig: Rig, 
 
 
 @pytest.mark.parametrize("plural", ["secrets", "leases"])
-def test_what_belongs_to_a_pool_has_its_labels(rig: Rig, told: Told, plural: str) -> None:
+def test_objects_of_a_pool_have_its_labels(rig: Rig, told: Told, plural: str) -> None:
     rig.own(told).demand(1)
     replicas_become(rig, told, 1)
     name = names.secret_name("es-1") if plural == "secrets" else names.master_lease_name("es-1")
@@ -191,7 +189,7 @@ def test_what_belongs_to_a_pool_has_its_labels(rig: Rig, told: Told, plural: str
     assert labels[names.LABEL_POOL_UID] == rig.pool()["metadata"]["uid"]
 
 
-def test_the_secret_makes_nobody_the_master(rig: Rig, told: Told) -> None:
+def test_the_secret_holds_no_private_key_of_a_master(rig: Rig, told: Told) -> None:
     rig.own(told).demand(1)
     replicas_become(rig, told, 1)
     data = rig.get("secrets", names.secret_name("es-1"))["data"]
@@ -271,7 +269,7 @@ def test_names_to_release_are_written_until_their_pods_are_gone(
 # -- Notices
 
 
-def test_it_tells_status_and_pods(rig: Rig, told: Told) -> None:
+def test_it_reports_status_and_pods(rig: Rig, told: Told) -> None:
     rig.own(told).demand(1)
     replicas_become(rig, told, 1)
     status = {"observedGeneration": 9, "phase": "Ready"}
@@ -283,7 +281,7 @@ def test_it_tells_status_and_pods(rig: Rig, told: Told) -> None:
     assert (name, pod and pod["metadata"]["name"]) == ("es-1-a", "es-1-a")
 
 
-def test_pods_of_other_pools_are_none_of_its_business(rig: Rig, told: Told) -> None:
+def test_pods_of_other_pools_are_ignored(rig: Rig, told: Told) -> None:
     rig.own(told).demand(1)
     replicas_become(rig, told, 1)
     others = {"metadata": {"name": "x", "labels": {names.LABEL_POOL_UID: "another"}}, "spec": {}}
@@ -305,7 +303,7 @@ def test_a_pool_that_somebody_deletes_is_an_error(rig: Rig, told: Told) -> None:
 # -- What keeps it waiting
 
 
-def test_who_begins_to_wait_is_told_what_others_were_told_before(
+def test_a_new_waiter_gets_earlier_notices(
     rig: Rig, told: Told, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tries: queue.Queue[None] = queue.Queue()
@@ -376,7 +374,7 @@ def test_each_right_that_is_missing_is_spoken_of(rig: Rig, told: Told) -> None:
         (Fault(status=422, reason="Invalid", message="spec.x: too big"), "Invalid", "spec.x"),
     ],
 )
-def test_what_keeps_it_from_being_born_is_said_at_once(
+def test_obstacles_of_the_creation_are_reported_at_once(
     rig: Rig, told: Told, fault: Fault, reason: str, advice: str
 ) -> None:
     fault.verb, fault.plural = "create", names.PLURAL
@@ -422,7 +420,9 @@ def test_a_watch_that_is_forbidden_is_not_taken_for_a_missing_operator(
     assert told.error().reason == "Forbidden"
 
 
-def test_an_operator_that_is_silent(rig: Rig, told: Told, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_silent_operator_is_reported(
+    rig: Rig, told: Told, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(fiber_pool, "OPERATOR_SLOW", 0.05)
     monkeypatch.setattr(fiber_pool, "OPERATOR_ABSENT", 0.2)
     rig.operator.mute = True
@@ -434,7 +434,7 @@ def test_an_operator_that_is_silent(rig: Rig, told: Told, monkeypatch: pytest.Mo
     assert "was not reconciled by an operator" in warning
 
 
-def test_a_pool_of_which_nothing_comes_is_given_back_at_once(
+def test_a_pool_without_pods_is_given_back_at_once(
     rig: Rig, told: Told, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fiber_pool, "OPERATOR_SLOW", 0.1)
@@ -447,7 +447,7 @@ def test_a_pool_of_which_nothing_comes_is_given_back_at_once(
 
 
 @pytest.mark.slow
-def test_an_operator_of_which_nothing_could_be_heard(
+def test_an_unreadable_pool_is_not_blamed_on_the_operator(
     rig: Rig, told: Told, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fiber_pool, "OPERATOR_SLOW", 0.2)
@@ -510,7 +510,7 @@ def test_closing_deletes_the_pool_and_all_it_has(rig: Rig, told: Told) -> None:
     assert not told.errors
 
 
-def test_closing_at_once_leaves_nothing(rig: Rig, told: Told) -> None:
+def test_closing_at_once_leaves_no_object(rig: Rig, told: Told) -> None:
     rig.own(told).close()
     for plural in (names.PLURAL, "secrets", "leases"):
         assert rig.server.objects(plural) == []
@@ -538,7 +538,7 @@ def test_a_namesake_is_not_deleted(rig: Rig, told: Told) -> None:
     assert len(rig.server.objects(names.PLURAL)) == 1
 
 
-def test_what_stays_behind_is_said_with_the_command_that_removes_it(
+def test_leftovers_are_named_with_the_command_that_removes_them(
     rig: Rig, told: Told, capsys: pytest.CaptureFixture[str]
 ) -> None:
     client = rig.own(told)
@@ -551,7 +551,7 @@ def test_what_stays_behind_is_said_with_the_command_that_removes_it(
     assert "stays behind" in said
 
 
-def test_one_that_is_interrupted_says_what_stays_too(
+def test_an_interrupted_close_names_the_leftovers_too(
     rig: Rig, told: Told, capsys: pytest.CaptureFixture[str]
 ) -> None:
     client = rig.own(told)

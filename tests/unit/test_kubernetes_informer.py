@@ -62,7 +62,7 @@ def case(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Case]:
         case.end()
 
 
-def test_it_tells_what_is_there_and_what_changes(case: Case) -> None:
+def test_it_reports_objects_and_their_changes(case: Case) -> None:
     case.add("a")
     case.watch.start()
     assert case.next() == ["+a"]
@@ -72,7 +72,7 @@ def test_it_tells_what_is_there_and_what_changes(case: Case) -> None:
     assert case.next() == ["-a"]
 
 
-def test_what_was_gone_before_it_looked_is_told(case: Case) -> None:
+def test_objects_gone_before_the_first_list_are_reported(case: Case) -> None:
     case.follow(known={"a", "b"})
     case.add("b")
     case.watch.start()
@@ -80,7 +80,7 @@ def test_what_was_gone_before_it_looked_is_told(case: Case) -> None:
 
 
 @pytest.mark.parametrize("how", ["cut off", "refused once", "listed too late"])
-def test_nothing_is_lost_where_a_watch_ends(case: Case, how: str) -> None:
+def test_no_change_is_lost_when_a_watch_ends(case: Case, how: str) -> None:
     case.add("a")
     case.add("b")
     case.watch.start()
@@ -113,7 +113,7 @@ def test_after_an_end_it_goes_on_without_a_list(case: Case) -> None:
     assert case.server.api.count("list", "pods") == 1
 
 
-def test_what_keeps_it_from_going_on_is_told_until_it_passes(case: Case) -> None:
+def test_a_lasting_error_is_reported_until_it_passes(case: Case) -> None:
     case.server.api.faults.append(Fault("list", "pods", status=403, message="no right", times=2))
     case.watch.start()
     assert [str(case.troubles.get(timeout=PATIENCE)) for _ in range(2)] == ["no right"] * 2
@@ -121,7 +121,7 @@ def test_what_keeps_it_from_going_on_is_told_until_it_passes(case: Case) -> None
     assert case.next() == ["+a"]
 
 
-def test_a_connection_that_breaks_once_is_nothing_to_speak_of(case: Case) -> None:
+def test_a_single_broken_connection_is_not_reported(case: Case) -> None:
     case.watch.start()
     for name in ("a", "b"):
         case.add(name)
@@ -132,7 +132,7 @@ def test_a_connection_that_breaks_once_is_nothing_to_speak_of(case: Case) -> Non
     assert case.troubles.empty()
 
 
-def test_an_api_that_stays_away_is_told(case: Case) -> None:
+def test_a_lasting_outage_of_the_api_is_reported(case: Case) -> None:
     case.watch.start()
     case.add("a")
     case.next()
@@ -162,7 +162,7 @@ def test_an_api_that_ends_every_watch_at_once_is_not_flooded(
     assert drawn[-1] >= 4 * informer._PAUSE_MIN
 
 
-def test_who_is_asked_to_come_back_later_does(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_retry_after_is_respected(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
     pauses: queue.Queue[float] = queue.Queue()
 
     def wait(seconds: float) -> bool:
@@ -189,7 +189,7 @@ def test_one_that_was_never_started_is_stopped(case: Case) -> None:
     assert case.told.empty()
 
 
-def test_a_long_list_comes_in_pages_and_what_changes_meanwhile_is_told(case: Case) -> None:
+def test_a_long_list_comes_in_pages_with_the_changes_meanwhile(case: Case) -> None:
     pods = [f"pod-{number:03}" for number in range(2 * informer._PAGE + 1)]
     for name in pods:
         case.add(name)

@@ -65,7 +65,7 @@ def case(rig: Rig) -> Case:
     return Case(rig)
 
 
-def test_it_says_who_lives_since_when_and_for_how_long(case: Case) -> None:
+def test_the_lease_names_holder_start_and_duration(case: Case) -> None:
     before = case.lease()
     assert before["holderIdentity"] == MASTER.identity
     assert before["leaseDurationSeconds"] == 30
@@ -116,7 +116,7 @@ def test_none_is_made_for_a_pool_that_is_gone(case: Case) -> None:
     assert case.rig.server.api.count("create", "leases") == 0
 
 
-def test_who_was_held_or_stopped_goes_on_where_the_pool_waited(case: Case) -> None:
+def test_a_paused_program_renews_if_the_pool_has_waited(case: Case) -> None:
     case.now += 45
     case.renewer.renew()
     case.rig.server.api.calls.clear()
@@ -125,7 +125,7 @@ def test_who_was_held_or_stopped_goes_on_where_the_pool_waited(case: Case) -> No
     assert case.rig.server.api.count("get", names.PLURAL) == 0  # it is in time again
 
 
-def test_who_was_held_or_stopped_does_not_renew_anothers(case: Case) -> None:
+def test_a_paused_program_does_not_renew_anothers_lease(case: Case) -> None:
     patch = {"spec": {"master": OTHER.spec("es-1", 2)}}
     case.rig.server.do(case.rig.server.store.merge, names.PLURAL, NAMESPACE, "es-1", patch)
     before = case.lease()
@@ -161,7 +161,7 @@ def test_a_pool_that_is_being_deleted_is_lost(case: Case) -> None:
     assert loss.reason == "Deleted"
 
 
-def test_what_failed_does_not_count_as_renewed(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_renewal_does_not_count(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fiber_pool, "_TIMEOUT", 0.0)
     case.rig.server.api.faults.append(Fault("patch", "leases", status=503))
     case.now += 20
@@ -217,7 +217,7 @@ def test_the_thread_ends_when_the_pool_is_lost(rig: Rig) -> None:
     case.renewer.join(PATIENCE)
 
 
-def test_the_thread_tells_what_keeps_it_from_renewing(rig: Rig) -> None:
+def test_the_thread_reports_failed_renewals(rig: Rig) -> None:
     case = Case(rig, duration=0)
     rig.server.api.faults.append(Fault("patch", "leases", status=422))
     case.renewer.start()
@@ -272,7 +272,7 @@ def test_refusals_count_from_the_first_after_something_else(case: Case) -> None:
         case.renewer._attempt()
 
 
-def test_a_fault_of_ours_is_told(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_internal_error_is_reported(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     case = Case(rig, duration=0)
     monkeypatch.setattr(case.renewer, "renew", lambda: 1 / 0)
     case.renewer.start()

@@ -28,7 +28,7 @@ def merged(**spec: Any) -> dict[str, Any]:
     return result
 
 
-def test_nothing_over_it_leaves_it_and_is_a_copy() -> None:
+def test_an_empty_patch_makes_a_copy() -> None:
     result = merge_template(OURS, {})
     assert result == OURS
     result["spec"]["nodeSelector"]["zone"] = "b"
@@ -79,7 +79,7 @@ def test_a_named_thing_can_be_deleted() -> None:
     assert worker["volumeMounts"] == []
 
 
-def test_what_makes_no_sense_is_left_to_the_api_server() -> None:
+def test_invalid_templates_are_left_to_the_api_server() -> None:
     for nonsense in ("text", [{"value": "1"}], [3]):
         (worker,) = merged(containers=[{"name": "worker", "env": nonsense}])["containers"]
         assert worker["env"] == nonsense

@@ -130,7 +130,7 @@ def test_a_pod_that_ended_says_why(
         pod(phase="Pending", containerStatuses=None, conditions=None),
     ],
 )
-def test_a_pod_that_is_well_says_nothing(document: dict[str, Any]) -> None:
+def test_a_healthy_pod_has_no_reason(document: dict[str, Any]) -> None:
     assert pod_end(document) is None
 
 

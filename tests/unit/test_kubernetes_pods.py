@@ -127,7 +127,7 @@ def site() -> Iterator[Site]:
     made.loop.stop()
 
 
-def test_what_nobody_foresaw_in_opening_ends_the_wait(site: Site) -> None:
+def test_an_unexpected_error_of_the_opening_ends_the_wait(site: Site) -> None:
     def prepare(cancel: threading.Event) -> PreparedPool:
         raise KeyError("containers")
 
@@ -158,7 +158,7 @@ def refuse_threads(thread: threading.Thread) -> None:
     raise RuntimeError("can't start new thread")
 
 
-def test_an_end_while_it_is_opened_makes_no_pool_and_closes_what_listens(site: Site) -> None:
+def test_an_end_during_the_opening_makes_no_pool_and_closes_the_listener(site: Site) -> None:
     asks, listener, attachment = threading.Event(), Listener(), Attachment()
 
     def prepare(cancel: threading.Event) -> PreparedPool:
@@ -181,7 +181,7 @@ def until_the_end(cancel: threading.Event) -> PreparedPool:
     raise FiberError("the end")
 
 
-def test_what_ends_the_wait_ends_that_of_who_comes_later_too(site: Site) -> None:
+def test_an_error_that_ends_the_wait_ends_later_waits_too(site: Site) -> None:
     pods = site.pods(until_the_end)
     hopeless = {"reason": "BackoffLimitExceeded", "message": "all die", "terminal": True}
     site.loop.call_soon(pods.on_status, {"problems": [hopeless]})
@@ -206,7 +206,7 @@ def test_an_agent_whose_pod_is_about_to_go_is_not_let_in(site: Site) -> None:
     pods.close()
 
 
-def test_the_live_line_goes_before_anybody_is_refused(
+def test_the_live_line_is_removed_before_a_refusal(
     site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(waiting, "_is_terminal", lambda: True)
@@ -258,7 +258,7 @@ def test_an_end_after_the_loop_has_failed(site: Site, monkeypatch: pytest.Monkey
     assert not closer.is_alive()
 
 
-def test_what_fails_while_a_pool_is_opened_leaves_nothing_that_listens(
+def test_a_failed_opening_leaves_no_listener(
     site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(*args: object) -> Any:
@@ -337,7 +337,7 @@ def test_an_agent_that_began_anew_is_let_in_and_its_pod_stays(site: Site) -> Non
     ],
     ids=["process", "pool"],
 )
-def test_a_process_that_waits_for_one_more_pod_is_told_what_for(
+def test_a_process_that_waits_for_one_more_pod_is_told_the_reason(
     worker: bool, told: list[str], site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A pool works with what it has; nothing else can do what a process is to do."""
@@ -400,7 +400,7 @@ def lose_pool(site: Site, pods: Pods, error: FiberPoolError, *, used: bool) -> t
     return child, owner
 
 
-def test_who_waits_for_a_pool_of_ours_that_is_lost_gets_the_next_one(site: Site) -> None:
+def test_waiters_of_the_own_pool_that_is_lost_get_the_next_one(site: Site) -> None:
     """Also where its agents had gone before anybody heard of that."""
     follows = site.pods(until_the_end)
     pods = site.pods(until_the_end, successor=lambda: follows.agents)
@@ -418,7 +418,7 @@ def test_who_waits_for_a_pool_of_ours_that_is_lost_gets_the_next_one(site: Site)
     [(False, "Deleted", True), (True, "NoOperator", True), (True, "Deleted", False)],
     ids=["somebody-elses", "not-lost", "never-of-use"],
 )
-def test_who_waits_for_what_another_pool_would_not_change_is_refused(
+def test_a_process_that_another_pool_cannot_help_is_refused(
     ours: bool, reason: str, used: bool, site: Site
 ) -> None:
     successor = (lambda: pytest.fail("no other is to be made")) if ours else None

@@ -94,7 +94,7 @@ class TestFailure:
         ],
         ids=lambda one: str(one["problems"][0]["reason"]),
     )
-    def test_what_cannot_come_ends_the_wait(self, hopeless: dict[str, Any]) -> None:
+    def test_an_impossible_pod_ends_the_wait(self, hopeless: dict[str, Any]) -> None:
         error = failure(POOL, hopeless, joined=0)
         assert error is not None
         reason = hopeless["problems"][0]["reason"]
@@ -119,7 +119,7 @@ class TestFailure:
         ],
         ids=lambda one: "-".join(p["reason"] for p in one.get("problems", ())) or "nothing",
     )
-    def test_what_may_still_come_does_not(self, hopeful: dict[str, Any]) -> None:
+    def test_a_possible_pod_does_not_end_the_wait(self, hopeful: dict[str, Any]) -> None:
         assert failure(POOL, hopeful, joined=0) is None
 
     def test_a_pool_with_workers_goes_on(self) -> None:
@@ -137,7 +137,7 @@ class TestFailure:
 
 
 class TestOverdue:
-    def test_says_what_is_known(self) -> None:
+    def test_the_message_names_the_known_problem(self) -> None:
         late = status(UNSCHEDULABLE, desiredReplicas=30, pendingReplicas=30)
         error = overdue(POOL, late, 60.0, NOW, WAY)
         assert error.reason == "Unschedulable"
@@ -145,7 +145,7 @@ class TestOverdue:
             assert part in str(error)
         assert "kubectl describe fiberpool es-1a2b3c --namespace team" in str(error)
 
-    def test_says_that_nothing_is(self) -> None:
+    def test_the_message_names_the_absence_of_problems(self) -> None:
         error = overdue(POOL, {}, 60.0, NOW, WAY)
         assert error.reason == "StartTimeout"
         assert "the operator has not looked at it yet. See kubectl describe" in str(error)
@@ -188,7 +188,7 @@ class TestSummary:
             "(for 14 s)"
         )
 
-    def test_is_one_line_and_a_short_one(self) -> None:
+    def test_the_message_is_one_short_line(self) -> None:
         told = summary(status(problem("ContainerFailed", "x" * 500), problem("B")), NOW)
         assert len(told) < 180
         assert "..." in told
@@ -197,7 +197,7 @@ class TestSummary:
     def test_without_problems_has_the_counts(self) -> None:
         assert summary(status(desiredReplicas=2, readyReplicas=2), NOW) == "2 of 2 pods ready"
 
-    def test_of_nothing_says_so(self) -> None:
+    def test_an_empty_status_is_named(self) -> None:
         assert summary({}, NOW) == "the operator has not looked at it yet"
 
     @pytest.mark.parametrize("since", [None, "yesterday"])

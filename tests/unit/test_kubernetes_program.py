@@ -110,7 +110,7 @@ def test_a_claim_of_one_node_stays_behind_and_is_named_once(
         made.close()
 
 
-def test_a_claim_that_the_template_brings_is_not_told(rig: Rig) -> None:
+def test_a_claim_of_the_template_is_not_reported(rig: Rig) -> None:
     claims = VolumeClaims(("one-claim",))
     assert claims.warnings(POD) == []
     assert len(claims.warnings(without_claims(POD, claims.one_node))) == 1

@@ -63,7 +63,7 @@ def file(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("terminal")
 class TestOnATerminal:
-    def test_one_line_is_shown_each_second_and_goes(
+    def test_one_line_is_shown_each_second_and_removed(
         self, loop: SimulatedLoop, wait: Progress, said: Said
     ) -> None:
         wait.start()
@@ -81,7 +81,7 @@ class TestOnATerminal:
         loop.run_for(1)
         assert said.shown == [(1.0, "[fiber] 0 of 8 pods ready at 1"[:27])]
 
-    def test_a_short_wait_shows_nothing(
+    def test_a_short_wait_shows_no_line(
         self, loop: SimulatedLoop, wait: Progress, said: Said
     ) -> None:
         wait.start()

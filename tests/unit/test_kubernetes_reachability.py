@@ -41,7 +41,7 @@ class TestReachability:
         assert found.due == ERROR_AT - 1.0 + DOUBTED_AFTER
         assert found.judge(2, found.due) is Reachability.UNREACHABLE
 
-    def test_concludes_nothing_once_an_agent_has_dialled(self) -> None:
+    def test_a_dialled_agent_removes_the_doubt(self) -> None:
         found = ReachabilityProbe()
         found.judge(1, 0.0)
         found.prove()
@@ -153,7 +153,7 @@ def test_pods_that_may_serve_another_program_are_waited_for() -> None:
 
 
 @pytest.mark.parametrize("waits", [False, True], ids=["idle", "waiting"])
-def test_doubts_are_told_to_those_that_wait(waits: bool) -> None:
+def test_waiting_children_get_the_doubts(waits: bool) -> None:
     site = Site()
     if waits:
         site.start()

@@ -39,7 +39,7 @@ def told() -> Told:
     return Told()
 
 
-def test_the_first_error_is_told_before_what_it_leads_to_and_no_other(told: Told) -> None:
+def test_only_the_first_error_of_a_chain_is_reported(told: Told) -> None:
     told.reporter.fail(told.reporter.error("Deleted", "was deleted"))
     told.reporter.refused("scale", Forbidden("no", status=403))
     told.reporter.fault(KeyError("spec"))
@@ -59,7 +59,7 @@ def test_a_fault_of_ours_has_its_cause(told: Told) -> None:
     assert (error.pool, error.namespace, error.reason) == ("es", "lab", "Internal")
 
 
-def test_what_lasts_is_told_once_whatever_it_keeps_from_being_done(told: Told) -> None:
+def test_a_lasting_problem_is_reported_once(told: Told) -> None:
     for doing in ("scale", "watch", "scale"):
         told.reporter.trouble(doing, ServerUnreachable("no route"))
     assert told.starts() == ["warning: cannot scale the"]
@@ -74,7 +74,7 @@ def test_it_is_news_again_once_it_had_passed(told: Told) -> None:
     assert len(told.said) == 2
 
 
-def test_an_answer_gives_nobody_a_right(told: Told) -> None:
+def test_a_missing_right_is_reported_once_in_spite_of_answers(told: Told) -> None:
     for _ in range(2):
         told.reporter.trouble("scale", Forbidden("no", status=403))
         told.reporter.answered()
@@ -84,7 +84,7 @@ def test_an_answer_gives_nobody_a_right(told: Told) -> None:
     assert len(told.said) == 2
 
 
-def test_of_a_pool_that_is_given_back_nothing_is_told(told: Told) -> None:
+def test_a_returned_pool_is_not_reported(told: Told) -> None:
     told.reporter.mute()
     told.reporter.trouble("scale", ServerUnreachable("no route"))
     told.reporter.fail(told.reporter.error("Deleted", "was deleted"))

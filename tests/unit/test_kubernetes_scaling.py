@@ -61,7 +61,7 @@ def case() -> Case:
     return Case()
 
 
-def test_without_a_demand_nothing_is_written(case: Case) -> None:
+def test_without_a_demand_no_patch_is_written(case: Case) -> None:
     assert case.step() == math.inf
     assert case.pool.written == []
 
@@ -103,7 +103,9 @@ def test_more_names_than_one_patch_may_have_wait_for_room(case: Case) -> None:
     assert case.pool.written[-1] == (0, everyone[1:])
 
 
-def test_what_failed_is_tried_again_with_growing_pauses_and_what_is_newest(case: Case) -> None:
+def test_a_failed_patch_is_tried_again_with_growing_pauses_and_the_newest_demand(
+    case: Case,
+) -> None:
     case.pool.failures = [ServerUnreachable("down") for _ in range(8)]
     case.want(1)
     pauses = [case.step()]
@@ -142,7 +144,7 @@ def test_an_api_that_is_gone_is_waited_for(case: Case) -> None:
     assert case.now - 100 > 2 * REFUSED
 
 
-def test_what_will_never_be_accepted_is_raised(case: Case) -> None:
+def test_a_permanently_refused_demand_is_raised(case: Case) -> None:
     case.pool.failures = [Invalid("too many")]
     case.want(1)
     with pytest.raises(Invalid):
@@ -158,7 +160,7 @@ def test_a_pool_that_was_lost_is_why(case: Case, failure: ApiError) -> None:
         case.step()
 
 
-def test_who_is_asked_to_come_back_later_does(case: Case) -> None:
+def test_a_retry_after_is_respected(case: Case) -> None:
     case.pool.failures = [TooManyRequests("busy", retry_after=12.0), ServerError("no leader")]
     case.want(1)
     assert case.step() == 12

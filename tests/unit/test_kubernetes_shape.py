@@ -31,11 +31,11 @@ def test_equal_shapes_are_one_key() -> None:
         PodShape().with_resources(Resources(gpu=1)),
     ],
 )
-def test_whatever_decides_what_a_pod_is_like_makes_another_shape(other: PodShape) -> None:
+def test_every_property_of_a_pod_makes_another_shape(other: PodShape) -> None:
     assert other != PodShape.of(Config())
 
 
-def test_what_a_pod_does_not_show_is_no_part_of_a_shape() -> None:
+def test_invisible_settings_are_no_part_of_a_shape() -> None:
     assert PodShape.of(Config(idle_timeout=5, max_pods=3, retries=0)) == PodShape.of(Config())
 
 
@@ -52,7 +52,7 @@ def test_what_a_pod_does_not_show_is_no_part_of_a_shape() -> None:
         (None, "python"),
     ],
 )
-def test_a_program_is_called_what_people_know_it_by(path: str | None, name: str) -> None:
+def test_a_program_has_the_name_that_people_know(path: str | None, name: str) -> None:
     assert program_name(path) == name
 
 
@@ -122,7 +122,7 @@ class TestTemplates:
             ({"spec": {"nodeSelector": {"since": Path()}}}, "not JSON serializable.*in quotes"),
         ],
     )
-    def test_what_is_none_is_refused_with_the_reason(
+    def test_an_invalid_template_is_refused_with_the_reason(
         self, template: dict[str, Any], complaint: str
     ) -> None:
         with pytest.raises(ConfigError, match=complaint):

@@ -122,7 +122,7 @@ class TestElsewhere:
 
 
 class TestInAPod:
-    def test_a_worker_has_what_its_program_has(self) -> None:
+    def test_a_worker_has_its_programs_settings(self) -> None:
         template = like()
         worker = worker_of(template)
         assert set(template) == {"spec"}
@@ -139,7 +139,7 @@ class TestInAPod:
         assert spec["securityContext"] == {"fsGroup": 1000}
         assert [volume["name"] for volume in spec["volumes"]] == ["data"]
 
-    def test_and_nothing_that_is_that_pods_alone(self) -> None:
+    def test_a_worker_has_no_setting_of_that_pod_alone(self) -> None:
         template = like()
         assert set(template["spec"]) == {
             "containers",
@@ -215,7 +215,7 @@ class TestInAPod:
         like(PodShape(image="es:1").with_resources(Resources(cpu=1)))
         assert before == POD
 
-    def test_a_pod_with_nothing_in_it_is_enough(self) -> None:
+    def test_an_empty_pod_is_enough(self) -> None:
         pod = {"metadata": {}, "spec": {"containers": [{"name": "main", "image": "x"}]}}
         assert like(pod=pod)["spec"] == {
             "containers": [
@@ -254,7 +254,7 @@ class TestResources:
             "limits": {"cpu": "2"},
         }
 
-    def test_a_request_of_nothing_is_left_out(self) -> None:
+    def test_an_empty_request_is_omitted(self) -> None:
         shape = PodShape.of(Config(cpu_request=0, memory_request=0))
         assert "resources" not in worker_of(like(shape))
 
@@ -298,7 +298,7 @@ class TestResources:
         assert [v["name"] for v in spec["volumes"]] == ["data", "fiber-shm"]
         assert worker_of({"spec": spec})["resources"] == {"requests": {"memory": "128Mi"}}
 
-    def test_no_gpu_is_nothing_to_ask_for(self) -> None:
+    def test_zero_gpus_are_not_requested(self) -> None:
         assert "resources" not in worker_of(like(PodShape().with_resources(Resources(gpu=0))))
 
 
@@ -321,7 +321,7 @@ class TestTheUsersTemplate:
         assert (worker["image"], worker["command"]) == ("mine:1", AGENT)
 
     @pytest.mark.parametrize("field", ["command", "args"])
-    def test_may_say_what_runs(self, field: str) -> None:
+    def test_the_template_may_set_the_command(self, field: str) -> None:
         worker = worker_of(self.template({"containers": [{"name": "worker", field: ["x"]}]}))
         assert {key: worker[key] for key in worker if key in ("command", "args")} == {field: ["x"]}
 

@@ -73,7 +73,7 @@ def test_attaching_and_leaving_it_as_it_was(rig: Rig, told: Told) -> None:
     assert not told.errors
 
 
-def test_a_lease_that_may_not_be_written_keeps_nobody_in_the_pool(rig: Rig, told: Told) -> None:
+def test_a_lease_without_write_access_does_not_hold_the_pool(rig: Rig, told: Told) -> None:
     before = spec(rig)
     client = rig.warm(told)
     client.demand(3)
@@ -84,7 +84,7 @@ def test_a_lease_that_may_not_be_written_keeps_nobody_in_the_pool(rig: Rig, told
     assert spec(rig) == before
 
 
-def test_the_lease_is_the_pools_and_nobodys_afterwards(rig: Rig, told: Told) -> None:
+def test_the_lease_is_released_with_the_pool(rig: Rig, told: Told) -> None:
     client = rig.warm(told)
     client.demand(1)
     told.wait(lambda: spec(rig)["replicas"] == 1)
@@ -124,7 +124,7 @@ def test_a_lease_without_the_label_gets_it(rig: Rig, told: Told) -> None:
     assert lease["spec"]["holderIdentity"] == MASTER.identity
 
 
-def test_a_second_master_is_told_who_is_there_and_since_when(rig: Rig, told: Told) -> None:
+def test_a_second_master_learns_the_holder_and_its_start(rig: Rig, told: Told) -> None:
     first = rig.warm(told)
     first.demand(1)
     told.wait(lambda: spec(rig)["replicas"] == 1)
@@ -157,7 +157,7 @@ def test_a_master_that_is_lost_is_replaced_and_its_demand_forgotten(rig: Rig, to
     assert spec(rig)["replicas"] == 0
 
 
-def test_what_the_operator_said_of_an_earlier_master_does_not_count(rig: Rig, told: Told) -> None:
+def test_statuses_of_an_earlier_master_do_not_count(rig: Rig, told: Told) -> None:
     set_status(rig, observedGeneration=1, conditions=alive("False"))
     leave_master(rig)
     rig.warm(told)
@@ -242,7 +242,7 @@ def test_no_such_pool(rig: Rig, told: Told) -> None:
     assert "kubectl get fiberpools -n lab" in str(error)
 
 
-def test_what_stays_behind_is_said_with_the_command_that_detaches(
+def test_leftovers_are_named_with_the_command_that_detaches(
     rig: Rig, told: Told, capsys: pytest.CaptureFixture[str]
 ) -> None:
     client = rig.warm(told)
@@ -306,7 +306,7 @@ def test_one_that_was_deleted_is_not_begun_anew(rig: Rig, told: Told) -> None:
     assert "begins anew" not in str(error)
 
 
-def test_one_that_another_program_took_says_what_to_wait_for(rig: Rig, told: Told) -> None:
+def test_a_pool_taken_by_another_program_names_the_wait(rig: Rig, told: Told) -> None:
     rig.warm(told)
     has_master(rig, told, 1)
     leave_master(rig)

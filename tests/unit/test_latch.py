@@ -41,7 +41,7 @@ def test_it_happens_once_and_stays() -> None:
     assert latch.wait(0)
 
 
-def test_all_who_wait_go_on() -> None:
+def test_all_waiters_go_on() -> None:
     latch = Latch()
     went_on: list[bool] = []
     threads = [
@@ -58,7 +58,7 @@ def test_all_who_wait_go_on() -> None:
     assert latch._waiters._locks == []
 
 
-def test_two_who_wake_release_each_lock_once() -> None:
+def test_two_waking_waiters_release_each_lock_once() -> None:
     waiters = Waiters()
     locks = [waiters.join() for _ in range(1000)]
     threads = [threading.Thread(target=waiters.wake) for _ in range(4)]
@@ -69,7 +69,7 @@ def test_two_who_wake_release_each_lock_once() -> None:
     assert not any(lock.locked() for lock in locks)
 
 
-def test_waiting_in_vain_leaves_nothing() -> None:
+def test_a_timed_out_wait_leaves_no_waiter() -> None:
     latch = Latch()
     for timeout in (0, 0.001, -1.0):
         assert not latch.wait(timeout)
@@ -141,7 +141,7 @@ def test_a_signal_that_raises_as_the_wait_begins_leaves_it_to_others(
     assert latch._waiters._locks == []
 
 
-def test_a_handler_may_set_what_it_interrupts_the_wait_for() -> None:
+def test_a_handler_may_set_the_latch_whose_wait_it_interrupts() -> None:
     latch = Latch()
     before = signal.signal(signal.SIGUSR1, lambda signum, frame: latch.set())
     try:

@@ -62,14 +62,14 @@ def test_an_interrupted_wait_leaves_the_result_to_others(monkeypatch: pytest.Mon
     assert found.get(0) == 3
 
 
-def test_waiting_in_vain_leaves_nothing() -> None:
+def test_a_timed_out_wait_leaves_no_waiter() -> None:
     found = result()
     for _ in range(3):
         found.wait(0)
     assert found._done._waiters._locks == []
 
 
-def test_all_who_wait_go_on() -> None:
+def test_all_waiters_go_on() -> None:
     found = result()
     threads = [threading.Thread(target=found.wait) for _ in range(3)]
     for thread in threads:
