@@ -58,12 +58,15 @@ log = logging.getLogger(__name__)
 
 
 ENOUGH = 1.0
-"""Seconds for which pods are changed, so that the status is not out of date for long."""
+"""Seconds that a pass changes pods before the next pass writes the status again."""
 DELETIONS = 50
 """Most pods that are deleted at the same time."""
 
 _NO_VERDICTS = ("does not support dry run", QUOTA_IS_FULL)
-"""Words of refusals of a dry run that do not judge the template: an unfit webhook, a full quota."""
+"""Texts of dry-run refusals that say nothing about the template.
+
+The cause is a webhook that does not support dry run, or a full quota.
+"""
 
 RIVAL = (
     "another program wrote this pool's status, probably the operator of another release. Two "
@@ -91,7 +94,7 @@ class PoolMemory:
     oversized: str = ""
     """Why the operator does not read the spec: it has too many values.  Empty: it does."""
     told: Mapping[str, Any] = field(default_factory=dict)
-    """Status that was written for a pool that the operator does not read."""
+    """Last status that was written while the spec was not read; empty if none was."""
     generation: int = -1
     """Generation of the pool in this reconcile, or in the last one that did not fail."""
 

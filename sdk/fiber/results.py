@@ -99,7 +99,7 @@ class ApplyResult(Generic[_T]):
         value: _T = outcome
         return value
 
-    # What the executor says
+    # Called by the executor, on the loop thread
 
     def add_results(self, start: int, outcomes: list[Any], mixed: bool, size: int = 0) -> bool:
         """Take the outcome."""

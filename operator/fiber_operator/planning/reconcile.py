@@ -149,9 +149,9 @@ def assess_trial(
     A template is tried out until one of its pods is Ready.  If a pod cannot start, or if earlier
     ones are ``failing``, no more than ``CANARIES`` exist, including the failed ones that are
     ``held_back``.  Otherwise their number doubles every ``PATIENCE`` seconds, because an image may
-    take long to fetch, and fetching it on three nodes does not help the others.  Pods that no node
-    takes do not count.  As many again may ask for a node, because a cluster autoscaler must see the
-    whole demand.
+    take long to fetch, and fetching it on three nodes does not help the others.  Unschedulable
+    pods do not count.  While there are more of them than other pods, more pods are created, because
+    a cluster autoscaler must see the whole demand.
     """
     if proven:
         return Trial()

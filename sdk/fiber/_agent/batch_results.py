@@ -1,8 +1,8 @@
 """The results of one batch of a pool worker: collected, made safe to send, sent in pieces.
 
 Two threads use them.  The thread that runs the tasks appends results; the watchdog
-(``watchdog.py``) may send those that are there.  A value counts once it is in ``values``, so its
-pickle and buffers are stored before.
+(``worker.Watchdog``) may send them.  The watchdog sends what is in ``values``, so the pickle and
+buffers of a value are stored before the value is appended.
 """
 
 from __future__ import annotations
@@ -86,7 +86,8 @@ class BatchResults:
     def add(self, value: Any) -> bool:
         """Take the next task's value in its present state: a later task may change the object.
 
-        True: call ``flush`` before the next task, which may write to the value's memory.
+        If the result is True, call ``flush`` before the next task, which may write to the value's
+        memory.
         """
         if work.is_plain_value(value):
             self.values.append(value)

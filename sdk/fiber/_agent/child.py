@@ -137,10 +137,10 @@ def die_with_parent(parent: int) -> None:
 
 
 def go_on_without_parent() -> None:
-    """Have the kernel continue this process, if it is stopped, when its parent dies.
+    """Have the kernel send SIGCONT to this process when its parent dies, as it may be stopped.
 
-    Without this, the kernel continues only process groups that were stopped before that moment.  A
-    stop that takes effect just after it would last for ever.
+    By itself, the kernel continues only process groups that were stopped before the parent's death.
+    A stop that takes effect just after the death would last for ever.
     """
     _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGCONT)
 
@@ -163,7 +163,8 @@ def run(
     """
     if start.method == "spawn":
         _exec(start, fds, progress_table, agent, words)
-    # The zygote's imports may have registered functions, say to remove a folder: not for children.
+    # The zygote's imports may have registered exit functions, such as the removal of a folder.
+    # Children must not run them.
     atexit._clear()
     atexit.register(util._exit_function)  # type: ignore[attr-defined]
     return _run(start, fds, progress_table, agent, words)
@@ -187,7 +188,8 @@ def _run(
     try:
         return _load_and_run(start, agent, arguments, payload)
     finally:
-        # Up to Python 3.12 ``_bootstrap`` runs multiprocessing's, which then run no second time.
+        # Up to Python 3.12, ``_bootstrap`` has run multiprocessing's exit functions already.  Those
+        # do nothing when they run again here.
         atexit._run_exitfuncs()
         util._flush_std_streams()  # type: ignore[attr-defined]
 
@@ -275,7 +277,7 @@ def _own_path(folder: str) -> tuple[list[str], list[str]]:
 
 @contextlib.contextmanager
 def inheriting() -> Iterator[None]:
-    """Forbid to start processes; a main module that starts one at its import is unguarded."""
+    """Forbid the start of processes in this block, in which a main module without guard is run."""
     mp_process.current_process()._inheriting = True  # type: ignore[attr-defined]
     try:
         yield
@@ -291,7 +293,7 @@ def prepare_paths(data: dict[str, Any]) -> None:
         known = set(sys.path)
         sys.path += [p for p in data["sys_path"] if p not in known and os.path.exists(p or ".")]
     sys.argv[:] = data["sys_argv"]
-    # The parent can be in a directory that is gone or forbidden, too.
+    # The parent's working directory may be removed, or forbidden for this process.
     with contextlib.suppress(OSError):
         os.chdir(data["dir"])
 
@@ -318,7 +320,7 @@ def _prepare_environment(data: dict[str, Any]) -> None:
         function(*arguments)
     numpy_random = sys.modules.get("numpy.random")
     if numpy_random is not None:
-        # Forked copies of one generator would explore the same noise.
+        # Forked copies of one generator would yield the same numbers.
         numpy_random.seed()
 
 

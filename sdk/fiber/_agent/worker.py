@@ -143,7 +143,7 @@ class BatchRunner:
     def _run_call(
         self, seq: int, body: memoryview, buffers: list[memoryview], started: float
     ) -> None:
-        """Run and answer a single call, by the shortest way, which every ``apply`` takes."""
+        """Run and answer a single call, on the fast path that every ``apply`` takes."""
         self._note(seq)
         taken: Taken = []
         try:
@@ -242,7 +242,7 @@ class BatchRunner:
         self._watchdog.end()
 
     def _run_eagerly(self, batch: BatchResults, function: _Function) -> None:
-        """Run the tasks one by one; note each position; make each result safe to send at once."""
+        """Run the tasks one by one; note each position; encode each result at once."""
         progress, values, numbers = self._progress, batch.values, work.NUMBERS
         for index, item in enumerate(batch.remaining):
             progress[1] = index
@@ -313,7 +313,7 @@ class BatchRunner:
                 self._interruptible = False
             except BaseException as error:
                 self._interruptible = False
-                # Otherwise SIGINT came after the last task.
+                # If no task is running, SIGINT came after the last one: there is no task to fail.
                 if batch.started() > len(values) and self._failed(batch, error):
                     raise
                 continue
@@ -389,7 +389,10 @@ SPLIT_EAGER_AFTER = 10e-3
 """Seconds that a batch may run before it is split, if its results are wanted one by one."""
 
 SPLIT_AFTER = 40e-3
-"""Seconds for other batches.  Both are a few times the work that a message should carry."""
+"""Seconds that another batch may run before it is split.
+
+Both limits are a few times the duration of the tasks that one message should carry.
+"""
 
 
 class Watchdog:
@@ -424,8 +427,8 @@ class Watchdog:
     def _run(self) -> None:
         seen = None
         while not self._stopped:
-            # Sleep if no batch runs, or its split is done.  The second line sees a batch that began
-            # after the first.  A batch that begins later puts a wake-up in the queue.
+            # Sleep if no batch runs, or if this thread has split it already.  ``_asleep`` is set
+            # before ``_batch`` is read: a batch that begins after the read puts a wake-up.
             self._asleep = True
             if self._batch is None or self._batch.seq == seen:
                 self._wake.get()
@@ -441,7 +444,7 @@ class Watchdog:
     def _wait_for_slow_batch(self) -> BatchResults | None:
         """Wait for a batch that runs for too long; return None once no batch runs.
 
-        On a busy machine a batch may not have begun yet.  A worker keeps at least one task.
+        A batch is not returned before its first task has begun: the worker must keep one task.
         """
         while (batch := self._batch) is not None:
             time.sleep(SPLIT_EAGER_AFTER if batch.eager else SPLIT_AFTER)

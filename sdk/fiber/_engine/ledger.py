@@ -42,7 +42,10 @@ from fiber._engine.tasks import (
 )
 
 LOOKAHEAD = 4
-"""Number of jobs that may lose their turn to a job whose tasks may queue."""
+"""Number of jobs, waiting for an idle worker, that an assignment may pass over.
+
+A later job may then queue a batch at a busy worker.
+"""
 
 _by_seq = attrgetter("seq")
 
@@ -60,7 +63,7 @@ class Ledger:
         self.starting = 0
         self.leased = 0
         """Number of workers that callers lease."""
-        self._open_tasks = 0  # fed and not done, of jobs that count
+        self._open_tasks = 0  # number of tasks of ``jobs`` that are fed and not done
         self._seq = itertools.count(1)
         self._turns: deque[Job] = deque()
         self._paused: set[Job] = set()
@@ -84,9 +87,9 @@ class Ledger:
         """Open a new job; ``limits`` says how often a task of it runs again.
 
         ``unit``: smallest chunk of contiguous tasks in a batch.  ``alone``: each task travels
-        alone, to an idle worker, with no batch queued behind it.  Without retries all tasks do.
-        Otherwise it would be unknown after a crash which tasks had run.  ``exact``: results are
-        wanted one by one, and the worker notes each task that it begins.
+        alone, to an idle worker, with no batch queued behind it.  A job without retries does so
+        too, since after a crash it must be known which task had run.  ``exact``: results are wanted
+        one by one, and the worker notes each task that it begins.
         """
         job = Job(owner, pace or TaskPace(), limits, unit, alone, exact)
         self.jobs.add(job)
@@ -161,7 +164,7 @@ class Ledger:
         return holders
 
     def pause(self, job: Job, paused: bool) -> None:
-        """Pause a job, except its tasks that were given out before, or resume it."""
+        """Hold back the tasks of a job that no worker has had yet; or end the pause."""
         job.paused = paused
         if not paused:
             self._paused.discard(job)
@@ -200,7 +203,7 @@ class Ledger:
         return True
 
     def spent(self) -> list[WorkerEntry]:
-        """Return workers that did all units they may do, each once; they get no more tasks."""
+        """Return the workers that have used up their ``left`` units; they get no more tasks."""
         spent, self._load.spent = list(self._load.spent), {}
         for worker in spent:
             self.retire(worker)
@@ -285,8 +288,8 @@ class Ledger:
     def _worker_for(self, job: Job, passed: int) -> WorkerEntry | None:
         """Return a worker that may get tasks of ``job``.
 
-        ``passed`` earlier jobs wait for an idle worker.  So as many of the workers that will be
-        idle soon are spared for them.
+        ``passed`` earlier jobs wait for an idle worker.  So as many workers that will soon be idle
+        are reserved for them.
         """
         idle = self._load.last_idle()
         if idle is not None:
@@ -304,7 +307,7 @@ class Ledger:
         if waiting > 1:
             workers = len(self.workers) + self.starting
             size = job.pace.batch_size(waiting, workers, job.unit, job.target)
-        if job.paused:  # the returned tasks may be in one span with held-back ones
+        if job.paused:  # a span may mix tasks that came back with tasks that are held back
             size = min(size, job.reached - job.waiting.first())
         if worker.left is not None:
             size = min(size, worker.left * job.unit)
@@ -482,9 +485,9 @@ class Ledger:
         self._finish(job)
 
     def split(self, seq: int, now: float) -> Receipt | None:
-        """Send the tasks of a batch that its worker cannot unpickle again, one by one.
+        """Queue the tasks of a batch again, to be sent one by one: its worker cannot unpickle it.
 
-        A batch of one task is at fault: its task is then done, and the receipt names it.
+        If the batch has one task, that task is at fault: it is done, and the receipt names it.
         """
         batch = self.batches.get(seq)
         if batch is None:
@@ -498,9 +501,9 @@ class Ledger:
         return None
 
     def expire(self, seq: int) -> Receipt | None:
-        """End the task of batch ``seq``, sent alone, after its time limit: it is done if it counts.
+        """End the task that was sent alone as batch ``seq``: its time limit has passed.
 
-        Its worker, which still runs it, gets no more tasks.
+        The worker still runs it, and gets no more tasks.  None if its result does not count.
         """
         batch = self.batches.get(seq)
         if batch is None:

@@ -47,8 +47,9 @@ class PoolWorkerSet:
     """Workers of a pool, ``minimum`` to ``maximum`` of them.
 
     ``members`` are the workers whose processes start or run.  ``size`` counts members that stay,
-    ``starting`` those of them that are not ready.  ``trouble`` says why no worker starts, once
-    that lasts.  If no worker is ready either, it is also the ``error``, and the pool gives up.
+    ``starting`` those of them that are not ready.  ``trouble`` is the reason why no worker starts,
+    once that has lasted for a while.  If no worker is ready either, it is also the ``error``, and the
+    pool gives up.
     """
 
     def __init__(self, minimum: int, maximum: int) -> None:
@@ -256,7 +257,7 @@ class Scheduler:
         """Remove a worker that is gone, for any reason; its tasks wait again.
 
         Return the tasks that have no tries left.  ``unread``, ``running`` and ``disrupted`` as for
-        ``Ledger.lose``, ``failure`` as for ``WorkerSet.gone``.
+        ``Ledger.lose``, ``failure`` as for ``PoolWorkerSet.gone``.
         """
         self.workers.gone(member, now, failure)
         if member.worker is None:

@@ -35,7 +35,7 @@ _NOT_READY = "it answered for batch {} before it was ready"
 
 
 class BatchSender:
-    """Sends batches.  Owns which batches are not sent, and what each worker was sent.
+    """Sends batches.  Owns the set of unsent batches, and the functions that each worker has.
 
     ``advance`` is called when the scheduler has to decide again.
     """
@@ -61,7 +61,7 @@ class BatchSender:
         """Functions that each worker was sent, and so remembers."""
 
     def send(self, batch: Batch) -> None:
-        """Send a batch, or have it encoded where the user's code may run."""
+        """Send a batch.  If encoding may run the user's code, the background thread encodes it."""
         assert batch.job is not None
         item: WorkItem = batch.job.owner
         if item.cancellable and not _claim(batch):
@@ -145,7 +145,7 @@ class BatchSender:
         self._limits.settled(seq)
 
     def split(self, seq: int, failure: object) -> None:
-        """Send the tasks of a batch one by one; of a single one, ``failure`` is the outcome."""
+        """Send the tasks of a batch again, one by one; a single task fails with ``failure``."""
         receipt = self._ledger.split(seq, self._loop.now())
         if receipt is not None:
             self._jobs.put(receipt, [failure])
@@ -160,7 +160,7 @@ class BatchSender:
         self._ledger.put_back(batch.worker, (batch.seq,), self._loop.now())
 
     def unread(self, worker: WorkerEntry, seqs: list[int]) -> None:
-        """Have the tasks of batches wait again that the worker will never read."""
+        """Queue the tasks of these batches again: the worker will never read the batches."""
         for seq in seqs:
             batch = self._ledger.batches.get(seq)
             if batch is None or batch.worker is not worker:
@@ -174,7 +174,7 @@ class BatchSender:
     # Ends
 
     def exited(self, handle: WorkerHandle, stack: str) -> None:
-        """Fail the task for whose time limit a worker was killed; ``stack`` is what it wrote."""
+        """Fail the task whose time limit ended this worker; ``stack`` has the worker's stacks."""
         self._limits.exited(handle, stack)
 
     def lost(self, worker: WorkerEntry) -> set[int]:
@@ -354,7 +354,7 @@ class AnswerReceiver:
     def take(self, handle: WorkerHandle, message: Message) -> None:
         """Take a packet from a worker."""
         try:
-            if not handle.fault:  # else it was killed for an earlier one
+            if not handle.fault:  # else it is being killed for an earlier message
                 self._take(handle, read(message))
         except WrongAnswer as error:
             self._kill(handle, str(error))
@@ -459,10 +459,10 @@ class AnswerReceiver:
         self._advance()
 
     def recalled(self, handle: WorkerHandle, seqs: list[int]) -> None:
-        """Have the tasks of batches wait again that the worker will never read."""
+        """Queue the tasks of these batches again: the worker will never read the batches."""
         if handle.worker is None:
             return
-        if 0 in seqs:  # the recall has taken back the request to end: it is sent again
+        if 0 in seqs:  # 0 numbers the request to end: the recall took it back, so send it again
             handle.dismiss()
         if handle.worker.leased:
             self._leases.keep_unread(handle, seqs)

@@ -3,13 +3,13 @@
 ::
 
     any thread           loop thread                                           worker
-    call, submit, … ───► Jobs ──► Scheduler.decide ──► _act ──► Sender ───────► run
+    call, submit, … ───► Jobs ──► Scheduler.decide ──► _act ──► BatchSender ──► run
                           ▲                                       │ ▲            │
                           │                  background thread ◄──┘ │            │
                           │                  (the user's picklers) ─┘            │
                           └─────────── on_message ◄──────────────────────────────┘
                           │
-                          └──► Future.add_results, set_done
+                          └──► TaskFuture.add_results, set_done
 
 The state changes on the loop thread alone, one event at a time, so no lock guards it.  A request
 may come from any thread, finalizer or signal handler.  It goes into the loop's queue, and wakes the
@@ -165,7 +165,7 @@ class PoolExecutor:
         self._loop.call_soon(self._advance)
 
     def choose_resources(self, function: Callable[..., Any]) -> None:
-        """Let the first task choose the resources of the workers, if hosts are made for them.
+        """Choose the workers' resources by this function, if Fiber makes hosts for the workers.
 
         ValueError if workers with other resources were chosen before.
         """
@@ -181,7 +181,7 @@ class PoolExecutor:
         timeout: float | None = None,
         queue: CallQueue | None = None,
     ) -> None:
-        """Submit a call.  ``queue`` has options of several calls, ``timeout`` is for this one."""
+        """Submit a call.  The calls of a ``queue`` share options; ``timeout`` is for this one."""
         call = pickle_call(future, function, args, kwargs, self.reject)
         if call is None:
             return
@@ -300,7 +300,7 @@ class PoolExecutor:
 
     @property
     def error(self) -> BaseException | None:
-        """Error for which no worker starts, once that is final."""
+        """Error that keeps workers from starting, once the pool has given up; None before."""
         return self._scheduler.workers.error
 
     def _check(self) -> None:
@@ -416,7 +416,7 @@ class PoolExecutor:
         for batch in decisions.assign:
             if batch.job is not None:
                 self._sender.send(batch)
-            else:  # it failed just now
+            else:  # its job failed just now
                 self._ledger.put_back(batch.worker, (batch.seq,), self._loop.now())
                 self._again = True
         given = (batch.job.owner for batch in decisions.assign if batch.job is not None)
@@ -446,7 +446,7 @@ class PoolExecutor:
         self._receiver.take(handle, message)
 
     def on_recalled(self, handle: WorkerHandle, seqs: list[int]) -> None:
-        """Have the tasks of batches wait again that the worker will never read."""
+        """Queue the tasks of these batches again: the worker will never read the batches."""
         self._receiver.recalled(handle, seqs)
 
     def _adopt(self, leased: LeasedWorker, call: Call) -> None:
@@ -462,7 +462,7 @@ class PoolExecutor:
         self._receiver.replay(leased)
 
     def _back(self, leased: LeasedWorker) -> None:
-        """Go on with a worker that was leased."""
+        """Take back a leased worker, and handle what happened to it during the lease."""
         if leased.report is not None:
             self.on_exit(leased.handle, leased.report)
         elif leased.draining:
@@ -510,7 +510,7 @@ class PoolExecutor:
     def on_exit(self, handle: WorkerHandle, report: ExitReport) -> None:
         """Remove a worker that has ended, asked or not."""
         if self._leases.keep_exit(handle, report):
-            return  # until the caller that uses it puts the lease back
+            return  # ``_back`` handles it when the caller returns the worker
         self._sender.exited(handle, report.stack)
         # The loss of a host is no failure of the worker.
         lost_host = report.disrupted or report.cause == Cause.AGENT_LOST

@@ -23,8 +23,10 @@ from fiber._wire import work
 from fiber.errors import TimeoutError, WorkerDied, block
 
 TICK = 1e-4
-"""Seconds that any timer waits at least: a shorter one would fire too early, by a rounding error,
-and would be set again and again."""
+"""Shortest delay of a timer, in seconds.
+
+A rounding error could make a shorter timer fire too early, and the executor would set it again.
+"""
 
 
 class Jobs:
@@ -163,7 +165,7 @@ class Jobs:
     def put_losses(
         self, losses: list[Loss], worker: str, pid: int | None, report: ExitReport
     ) -> None:
-        """Fail the tasks that were running in too many workers when these were lost."""
+        """Fail the tasks that have no tries left after the loss of a worker."""
         for loss in losses:
             item: WorkItem = loss.job.owner
             error = WorkerDied(

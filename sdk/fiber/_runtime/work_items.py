@@ -23,14 +23,14 @@ from fiber._transport.loop import DOZE
 from fiber._wire import packet, work
 
 FUNCTIONS = 128
-"""Number of functions that are recognized when they come again."""
+"""Number of functions whose pickles a FunctionCache keeps."""
 
 FUNCTION_SIZE = 1 << 16
-"""Largest pickle, in bytes, of a function that is recognized."""
+"""Largest pickle, in bytes, that a FunctionCache keeps."""
 
 
 AHEAD = 3
-"""Number of messages for which tasks are read ahead, for each worker."""
+"""Messages for each worker whose tasks a stream reads before the worker can take them."""
 
 
 class Function:
@@ -94,8 +94,8 @@ class InputStream:
     is used up, the reader waits at a queue of grants.
 
     ``limit`` bounds the tasks that are read and not consumed; ``consumed`` returns how many were
-    consumed.  ``notify`` is called, on the reading thread or the user's, when the executor can go
-    on: there is input, or room below the limit.
+    consumed.  ``notify`` is called when the executor can go on: when there is input (on the reading
+    thread), or when there is room below the limit (on the user's thread).
     """
 
     def __init__(
@@ -170,7 +170,7 @@ class InputStream:
     # The user's thread
 
     def ask(self) -> None:
-        """Notify if there was no room before: the user took results.
+        """Notify the executor that the user took results, if it found no room before.
 
         The mark is set after the notification, so an interrupted user notifies again next time.
         """
@@ -189,7 +189,7 @@ class InputStream:
         return taken
 
     def await_input(self) -> None:
-        """Notify when there is input.  Take once more after this: input may have come before."""
+        """Ask to be notified of input.  Call ``take`` after this: input may have come before."""
         self._awaited = True
 
     def grant(self, waiting: int, workers: int, pace: TaskPace, target: float) -> None:
@@ -327,6 +327,7 @@ class WorkItem:
         self.future = future
         self.unit = unit
         self.exact = exact
+        """True if results are wanted one by one, as with ``chunksize=1``."""
         self.timeout = timeout
         self.limits = limits
         """Limits of lost runs; None stands for the pool's."""
@@ -383,5 +384,5 @@ def _blame_call(
 
 
 def is_wanted(call: Any) -> bool:
-    """Tell whether a waiting call was not cancelled.  If it was, its waiters are notified."""
+    """Return False if a waiting call was cancelled; ``claim`` then notifies its waiters."""
     return not call.future.cancelled() or call.future.claim()

@@ -17,8 +17,9 @@ Only the thread that has removed a slot from its process's lists writes the slot
 A *revival* returns the tokens that no living process has noted.  One process at a time does it,
 under a robust mutex:
 
-1. It sets ``stop``.  After a moment, longer than any processor delays a store, each reader of
-   ``stop`` sees it, and each process that read it before is seen to be busy.
+1. It sets ``stop``, and waits for longer than any processor delays a store.  From then on each
+   process that reads ``stop`` sees it set.  A process that read it before has marked its slot as
+   BUSY, and the revival sees that mark.
 2. It waits until no living process is busy.  Then all living processes have noted their tokens, and
    none takes or returns a token.  (A process that is stopped in the middle postpones the revival,
    as it may hold the token.)
@@ -64,7 +65,7 @@ SEMAPHORE_SIZE = 1 << 15
 SLICE = 0.2
 """Seconds that one wait in the kernel lasts.
 
-For so long a signal may wait for its handler, and a token of a dead process may go unnoticed.
+It bounds the delay of a signal handler.  After each wait the waiter may look for lost tokens.
 """
 
 _MOMENT = 0.002  # seconds until all processors see a store
@@ -309,7 +310,7 @@ class SharedSemaphore:
             raise
 
     def _try_acquire(self, wait: tuple[bool] | tuple[bool, float], taken: list[int]) -> bool:
-        """Try once.  ``taken`` gets the slot on success, and keeps it after an interrupt."""
+        """Try once.  On success the slot is in ``taken``, also if an interrupt follows."""
         try:
             slot = self._idle.pop()
         except IndexError:
@@ -318,7 +319,7 @@ class SharedSemaphore:
         try:
             words[slot] = _BUSY
             if not words[_ATTENTION] & _IS_STOPPED:
-                # One step takes it and notes it: no signal's handler runs in between.
+                # One call takes the token and adds the slot: no signal handler runs in between.
                 taken.extend(compress((slot,), starmap(self._take, (wait,))))
         except BaseException:
             if taken:
@@ -346,7 +347,7 @@ class SharedSemaphore:
             self._ring()
 
     def _leave(self, slot: int) -> None:
-        """Leave a slot after an interrupt.  A revival finds out whether a token is lost."""
+        """Mark a slot as LEFT after an interrupt.  A revival finds out if its token is lost."""
         if self._is_recursive and self._is_mine():
             self._sem._after_fork()  # sets the count to zero: this thread no longer holds it
         self._words[slot] = _LEFT
@@ -405,7 +406,7 @@ class SharedSemaphore:
             return False
         states = [(words[slot], slot) for slot in self._used()]
         noted = sum(state == _HELD for state, _ in states)
-        # If all tokens are noted, a busy process has none: it waits for one.
+        # If HELD slots account for all tokens, a BUSY process has none: it waits for one.
         least = _HELD if noted == words[_TOTAL] else _BUSY
         return any(self._is_gone(slot) for state, slot in states if state >= least)
 
