@@ -94,18 +94,18 @@ class Creation:
         """Number of pods whose creation has not begun."""
         self._under_way: set[str] = set()
         self._unknown = 0
-        """Pods that were begun and that were not among those of the last ``see``."""
+        """Number of pods whose creation has begun and that the last ``see`` did not show."""
         self._task: asyncio.Task[None] | None = None
         self._done = Created()
 
     def see(self, pods: list[PodView]) -> None:
-        """Note the pods that are there, before it is planned how many to create."""
+        """Note the pods that the informer shows, before the plan that is based on them."""
         there = {pod.name for pod in pods}
         self._pace.unsure = [name for name in self._pace.unsure if name not in there]
         self._unknown = len(self._under_way - there)
 
     def aim(self, count: int, order: Order) -> None:
-        """Create as many more as make ``count`` with those under way that ``see`` did not get."""
+        """Create ``count`` pods, including those under way that the last ``see`` did not show."""
         self.order = order
         self._left = max(0, count - self._unknown)
         if self._left and (self._task is None or self._task.done()):

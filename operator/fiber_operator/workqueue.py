@@ -90,18 +90,18 @@ class _Entry:
     due: float | None = None
     """Time at which it is due; None: it does not wait."""
     blocked: float = -1e9
-    """No reconcile before this time, unless events cease."""
+    """Earliest time of the next reconcile."""
     rested: float = -1e9
-    """Time at which events of pods bring a reconcile, at the latest."""
+    """End of the pool's rest, when events of its pods bring a reconcile."""
     lull: bool = False
-    """True if they bring one earlier once they cease."""
+    """True if they bring it before the end of the rest, once they cease."""
     limit: float | None = None
-    """While it waits for that: when its reconcile comes though they do not cease."""
+    """Latest time of a reconcile that waits for the events to cease; None if none waits."""
     owed: float = 0.0
     """Seconds by which its last rest was shortened."""
     failures: int = 0
     running: float | None = None
-    """Since when."""
+    """Time at which its present reconcile began; None while none runs."""
     rush: bool = False
     """True if it was added urgently while it ran."""
     order: int = -1
@@ -117,7 +117,7 @@ class QueueStatistics:
     running: int
     known: int
     longest_wait: float
-    """Seconds that the one that waits longest is overdue."""
+    """Seconds for which the pool that waits longest is overdue."""
     longest_run: float
     """Seconds that the longest reconcile takes so far."""
     since_last_end: float
@@ -222,7 +222,7 @@ class WorkQueue:
             self._wake.set()
 
     def _first(self, heaps: _Heaps, namespace: str) -> tuple[float, Key] | None:
-        """The first place in the namespace's heap that is not void."""
+        """Return the first place in the namespace's heap that is not void."""
         heap = heaps[namespace]
         while heap:
             due, order, key = heap[0]
@@ -234,7 +234,7 @@ class WorkQueue:
         return None
 
     def _firsts(self) -> Iterator[tuple[float, _Heaps, str]]:
-        """Yield when the first pool of each namespace that may begin is due, and its place."""
+        """Yield the due time and the place of the first pool of each namespace that may begin."""
         under_way = Counter(namespace for _, namespace in self._tasks.values())
         everywhere, alone = self._open(self._concurrency), self._open(2 * self._concurrency)
         for heaps in alone:
@@ -245,7 +245,7 @@ class WorkQueue:
                     yield first[0], heaps, namespace
 
     def _open(self, most: int) -> list[_Heaps]:
-        """From where a reconcile may begin now if ``most`` may work at the same time."""
+        """Return the heaps whose pools may begin now, if ``most`` may work at the same time."""
         now = self._now()
         working = sum(started + LONG > now for started, _ in self._tasks.values())
         if working >= most or len(self._tasks) >= CROWD * most:

@@ -178,7 +178,7 @@ def mark_cut_off(pods: Sequence[PodView], cut_off: CutOff, *, attached: bool) ->
 
 
 def _names_its_own_address(pool: FiberPool) -> bool:
-    """The template says where to dial, and not the Service's address."""
+    """Return True if the template sets the address that agents dial."""
     return any(
         variable.get("name") == names.ENV_ADDRESS
         for container in items(mapping(pool.spec.template, "spec").get("containers"))
@@ -287,7 +287,7 @@ class Assessment:
 
     @property
     def floor(self) -> int:
-        """Number of workers that minReplicas keeps beyond the master's wish."""
+        """``minReplicas`` if the master wants fewer workers than that, else 0."""
         spec, forgotten = self.spec, self.idleness.forgotten
         return spec.min_replicas if spec.replicas < spec.min_replicas and not forgotten else 0
 

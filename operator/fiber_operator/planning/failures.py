@@ -1,8 +1,8 @@
 """Failed workers: each is counted once, and replaced after a delay.
 
 *Delay.*  The failures up to the next creation are one wave.  The delay doubles with each wave.  It
-starts anew once workers live: a new worker was Ready for a minute, or the workers that fail now
-were.  Only the places of failed workers wait; other missing workers are created at once.
+starts anew once workers live: when a new worker has been Ready for a minute, or when each worker
+that fails now had been.  Only the places of failed workers wait; other missing workers are created at once.
 
 *Giving up.*  After more than ``backoffLimit`` waves in a row, at none of which half of the wanted
 workers had been Ready for a minute, no pod is created until the spec changes.
@@ -93,7 +93,8 @@ def account(
     """Bring the account up to date.
 
     ``expected`` names pods whose end was requested.  ``late`` names pods that are not Ready in
-    time, which counts as a failure.  ``desired`` is how many wanted workers could exist.
+    time, which counts as a failure.  ``desired`` is the number of wanted workers, without those
+    that are missing for other reasons than failures.
     """
     found = _begin(before, pods, late, spec_hash, policy, now)
     ended = [p for p in pods if p.name not in found.counted and p.name not in expected]
@@ -216,8 +217,8 @@ def _recovers(
 ) -> float | None:
     """Return the time at which workers will have lived long enough, if none fails until then.
 
-    A worker that became Ready after the start of the last wave must stay Ready for a minute.  It is
-    also enough if all wanted workers do so: if fewer are wanted now, no new worker may come.
+    A worker that became Ready after the start of the last wave must stay Ready for a minute.  If all
+    wanted workers are Ready, older ones count too, because no new worker has to come.
     """
     if not found.waves or given_up(found, policy):
         return None

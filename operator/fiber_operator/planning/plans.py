@@ -124,7 +124,7 @@ class Knowledge:
     led: bool = True
     """True if the EndpointSlice leads to ``spec.master``."""
     creation: Obstacle | None = None
-    """Failure of the last creation or dry run that was no refusal."""
+    """Error of the last creation or dry run, if that failed and was not refused."""
     deletion: Obstacle | None = None
     """Failure of the last deletion."""
     accepted: str | None = None

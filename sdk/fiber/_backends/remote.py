@@ -113,7 +113,7 @@ class RemoteAgent:
         self._blobs.send_missing(child.blobs, child.begin)
 
     def describe_pod(self, pod: str, node: str, *, ending: str, disrupted: bool) -> None:
-        """Set what reports tell of the agent's pod."""
+        """Set the facts of the agent's pod, for the reports of its children."""
         self.pod, self.node, self.ending, self.disrupted = pod, node, ending, disrupted
 
     def withdraw(self, child: RemoteChild) -> bool:
@@ -247,7 +247,7 @@ class RemoteChild:
         self._early: list[tuple[int, BytesLike, Sequence[memoryview]]] = []
         """Packets to deliver after the Start."""
         self._unasked: list[messages.LinkMessage] | None = []
-        """Signals and recalls until the Start has left; they would overtake a large Start."""
+        """Signals and recalls that wait until the Start has left, so as not to overtake it."""
         self._delivered = 0
         self._latest: deque[int] = deque(maxlen=_REMEMBERED)
         self._channel: RemoteTaskChannel | None = None

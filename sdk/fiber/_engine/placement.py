@@ -39,7 +39,7 @@ class Placement(Generic[Agent, Child]):
         self.loads: dict[Agent, int] = {}
         """Number of children of each agent."""
         self.idle: OrderedDict[Agent, float] = OrderedDict()
-        """Agents without children and the times since when, the longest idle first."""
+        """Agents without children, each with the time since when; the longest idle first."""
         self._spread = spread
         self._withheld: dict[Agent, set[str]] = {}
         """Agents that get no children, with their reasons: at least one each."""
@@ -160,8 +160,9 @@ class Demand:
 
     More agents are wanted as soon as children wait for which the present agents have no room.  An
     agent is released after ``idle_timeout`` idle seconds.  The last ``floor`` agents stay,
-    since others want them.  When they are overdue, this demand does not count them.  So it gives up
-    only idle agents, by name, and agents that have not joined.
+    because the pool keeps so many by itself.  Once they have been idle for that time, the demand
+    does not count them.  So a smaller demand takes away only idle agents, which ``release`` names,
+    and agents that have not joined.
     """
 
     def __init__(

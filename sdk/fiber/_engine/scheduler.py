@@ -48,8 +48,8 @@ class PoolWorkerSet:
 
     ``members`` are the workers whose processes start or run.  ``size`` counts members that stay,
     ``starting`` those of them that are not ready.  ``trouble`` is the reason why no worker starts,
-    once that has lasted for a while.  If no worker is ready either, it is also the ``error``, and the
-    pool gives up.
+    once that has lasted for a while.  If no worker is ready either, it is also the ``error``,
+    and the pool gives up.
     """
 
     def __init__(self, minimum: int, maximum: int) -> None:

@@ -96,11 +96,13 @@ class ClientHandler:
         self._attachment: ObjectAttachment | None = None
         self._joined: BlockIdentity | None = None
         self._bound: set[bytes] = set()
+        """Grants that end with the stream."""
         self._holder: str | None = None
         """Name of the process whose token the stream keeps."""
         self._granted_last: int | None = None
         """Number of the last request that got a token, while the client may still give it up."""
         self._place: int | None = None
+        """Place of the client in the wait list of a condition."""
         self._claimed = False
         """True if the counter was lowered for this client, which has not confirmed that."""
         stream.handler = self
@@ -278,9 +280,9 @@ class ClientHandler:
             request.answer(Status.NO)
 
     def sync(self, message: Message) -> None:
-        """Reply, so that the client knows that no earlier reply follows.
+        """Reply after all earlier replies, so that the client knows that none is on its way.
 
-        Take back a token that the client got meanwhile, as it does not know of that.
+        Take back a token whose reply the client has not read.
         """
         if self._holder is not None:
             self._give_back()
@@ -316,7 +318,7 @@ class ClientHandler:
         self._channel().receive(self._counting(message), wait=True)
 
     def try_draw(self, message: Message) -> None:
-        """Do the same if a message is there."""
+        """Receive a message and raise a counter, if a message is there."""
         self._channel().receive(self._counting(message), wait=False)
 
     def _counting(self, message: Message) -> PendingRequest:

@@ -49,7 +49,7 @@ _COUNT_AGAIN = 0.2
 """Seconds between two checks for surplus slots."""
 
 _MOVE = 1e-4
-"""Seconds to wait while an item moves, as its thread may wait for a processor."""
+"""Seconds between two looks while an item moves from one count to the other."""
 
 
 class QueueSlots:
@@ -197,9 +197,9 @@ class Feeder:
         self._wake: SimpleQueue[bool] = SimpleQueue()
         self._sending = False
         self._thread = 0
-        self._moves = 0  # odd while an item is counted neither here nor there
-        # A thread takes the entry out before it feeds.  A caller that finds the entry starts a
-        # thread.  If two callers do, the second thread ends.
+        self._moves = 0  # odd while an item moves, and may be in neither count
+        # Holds one entry while no thread feeds.  A thread takes it out before it feeds.  A caller
+        # that finds it starts a thread.  If two callers do, the second thread ends.
         self._vacancy = [True]
         self._joins: list[util.Finalize] = []
         self._join_cancelled = False
@@ -207,7 +207,7 @@ class Feeder:
     def put(self, payload: bytes, buffers: list[memoryview], taken: list[Any]) -> None:
         """Send a message now if no item waits and there is room, otherwise later.
 
-        ``taken`` has a note of its slot, and is emptied when the feeder has the slot.
+        ``taken`` notes the item's slot.  It is emptied once the feeder is to free the slot.
         """
         # In this order: before the feeder takes an item out, it notes that it is sending.
         nothing_to_overtake = not self._unsent and not self._sending

@@ -42,7 +42,7 @@ class Popen:
         self._loop = loop = runtime().loop
         loop.depend(self)
         with naming_the_limit("starting a process"):
-            # A writer keeps a reference, so its descriptor is not closed and reused meanwhile.
+            # A thread that sets it keeps a reference, so the descriptor is not closed meanwhile.
             self._at_exit: Wakeup | None = Wakeup()
         self.sentinel = self._at_exit.fd
         try:

@@ -54,7 +54,7 @@ class KubernetesBackend:
         self._shape = PodShape.of(config)
         self._provisioner = PoolProvisioner(config)
         self._pods: dict[tuple[PodShape | str, int], Pods] = {}
-        """Pods by their shape or pool name, and by the number of such ``Pods`` before them."""
+        """``Pods`` by their shape or pool name, and by the number of earlier ones for the same."""
         self._closing = False
 
     def child(self, spec: ChildSpec, observer: ChildObserver) -> RemoteChild:
@@ -145,7 +145,7 @@ class Pods:
         self.over = False
         """True once the pool has failed or ended, and was deleted or detached from."""
         self._goes_on = False
-        """True if waiting children then move to the successor."""
+        """True if waiting children move to the successor once these pods are over."""
         self._preparation: Preparation | None = None
         self._prepared: PreparedPool | None = None
         self._client: FiberPoolClient | None = None
@@ -158,7 +158,7 @@ class Pods:
         self._given_up: set[str] = set()
         """Existing pods whose agents are released or lost; they are served no more."""
         self._back_again: RemoteAgent | None = None
-        """Agent that is lost only because the agent of the same pod has dialed again."""
+        """Earlier connection of an agent that has dialed again: its pod is not replaced."""
 
     def begin_close(self) -> None:
         """Begin to end the pool; return at once."""
@@ -180,7 +180,7 @@ class Pods:
             self._wait_for(lambda then: listener.close("the master ended", then=then))
 
     def _wait_for(self, ask: Callable[[Callable[[], None]], None]) -> None:
-        """Wait until the loop has done what ``ask`` asks for, unless the loop is broken."""
+        """Call ``ask`` with a callback, and wait for the callback, unless the loop is broken."""
         done = threading.Event()
         ask(done.set)
         if not self._loop.broken:
@@ -347,7 +347,7 @@ class Pods:
         before = self._waiting.status
         self._waiting.on_status(status)
         if self._prepared is not None:
-            # A warm pool keeps so many, unless the operator has detached this program.
+            # A warm pool keeps ``min_pods``, unless the operator has detached this program.
             self._demand.floor = min(self._prepared.min_pods, status.get("desiredReplicas") or 0)
         if before.get("templateHash") != status.get("templateHash"):
             for agent in self.agents.agents.values():
