@@ -2,7 +2,8 @@
 
 *Delay.*  The failures up to the next creation are one wave.  The delay doubles with each wave.  It
 starts anew once workers live: when a new worker has been Ready for a minute, or when each worker
-that fails now had been.  Only the places of failed workers wait; other missing workers are created at once.
+that fails now had been.  Only the places of failed workers wait; other missing workers are created
+at once.
 
 *Giving up.*  After more than ``backoffLimit`` waves in a row, at none of which half of the wanted
 workers had been Ready for a minute, no pod is created until the spec changes.
@@ -217,8 +218,8 @@ def _recovers(
 ) -> float | None:
     """Return the time at which workers will have lived long enough, if none fails until then.
 
-    A worker that became Ready after the start of the last wave must stay Ready for a minute.  If all
-    wanted workers are Ready, older ones count too, because no new worker has to come.
+    A worker that became Ready after the start of the last wave must stay Ready for a minute.  If
+    all wanted workers are Ready, older ones count too, because no new worker has to come.
     """
     if not found.waves or given_up(found, policy):
         return None

@@ -54,7 +54,7 @@ from fiber._wire.descriptor import Descriptor, opened, own
 class DescriptorHandle(Protocol):
     """Handle of a descriptor that goes along with a start message.
 
-    multiprocessing's ``DupFd`` and Fiber's ``InheritedDescriptor`` implement it.
+    multiprocessing's ``DupFd`` and ``fiber.reduction.PayloadDescriptor`` implement it.
     """
 
     def detach(self) -> int:
