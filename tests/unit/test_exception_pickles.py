@@ -102,7 +102,7 @@ def test_a_setstate_is_used() -> None:
     assert travelled(kinds.WithState(3, 0.5)).step == 4
 
 
-def test_a_setstate_gets_what_getstate_gives() -> None:
+def test_setstate_gets_the_value_of_getstate() -> None:
     found = travelled(kinds.HasLock(3))
     assert (found.step, found.lock.locked()) == (3, False)
     assert not hasattr(found, "__notes__")

@@ -51,7 +51,7 @@ def daemon() -> Iterator[int]:
     os.kill(pid, signal.SIGKILL)
 
 
-def test_nothing_is_found_where_nothing_is_left(watch: leaks.Watch) -> None:
+def test_a_clean_state_has_no_leaks(watch: leaks.Watch) -> None:
     before = watch.look()
     subprocess.run([sys.executable, "-c", ""], check=True, timeout=PATIENCE)
     assert watch.left_since(before) == []

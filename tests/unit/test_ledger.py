@@ -57,7 +57,7 @@ def test_tasks_fed_later_are_appended() -> None:
     assert list(batch.items) == [0, 1, 2, 3, 4]
 
 
-def test_memory_of_what_was_given_out_is_not_kept() -> None:
+def test_memory_of_assigned_tasks_is_released() -> None:
     ledger, _ = ledger_with(1)
     job = ledger.open(pace=known(1e-5))
     for n in range(20_000):
@@ -286,7 +286,7 @@ def test_a_chunk_counts_as_one() -> None:
     assert worker.left == 0
 
 
-def test_what_comes_back_unread_may_be_given_again() -> None:
+def test_unread_tasks_may_be_assigned_again() -> None:
     ledger, (worker,) = ledger_with(1, left=2)
     job_of(ledger, range(10))
     _, second = assign_all(ledger)
@@ -335,7 +335,7 @@ def test_repeated_and_late_results_do_not_count() -> None:
         (2, 2, 1, 6, "it kept 6 of 5 tasks"),
     ],
 )
-def test_a_worker_answers_for_nothing_but_its_own_next_tasks(
+def test_a_worker_answers_only_for_its_next_tasks(
     seq: int, offset: int, count: int, kept: int | None, words: str
 ) -> None:
     ledger, _ = ledger_with(2)
@@ -353,7 +353,7 @@ def test_a_worker_answers_for_nothing_but_its_own_next_tasks(
     assert job.finished
 
 
-def test_a_worker_gives_back_what_it_has_not_begun() -> None:
+def test_a_worker_gives_back_tasks_that_have_not_begun() -> None:
     ledger, (worker,) = ledger_with(1)
     job = job_of(ledger, range(10), pace=known(1e-6))
     (batch,) = assign_all(ledger)

@@ -11,7 +11,7 @@ from unit.ledger_steps import answer, assign_all, job_of, known, ledger_with, ru
 # Taking back
 
 
-def test_idle_workers_ask_for_what_others_have_not_begun() -> None:
+def test_idle_workers_ask_for_tasks_that_others_have_not_begun() -> None:
     ledger, (one, other) = ledger_with(2)
     job_of(ledger, range(4))
     batches = assign_all(ledger)
@@ -27,7 +27,7 @@ def test_idle_workers_ask_for_what_others_have_not_begun() -> None:
     assert stolen.worker is one
 
 
-def test_who_does_not_answer_does_not_keep_others_from_being_asked() -> None:
+def test_a_worker_without_an_answer_does_not_keep_others_from_being_asked() -> None:
     ledger, (one, other, third) = ledger_with(3)
     job_of(ledger, range(6))
     for batch in assign_all(ledger):
@@ -52,7 +52,7 @@ def test_the_time_to_ask_is_the_time_that_was_said() -> None:
     assert ledger.recall(due) == [other]
 
 
-def test_nothing_is_asked_for_while_something_waits() -> None:
+def test_no_recall_is_sent_while_tasks_wait() -> None:
     ledger, (one, _) = ledger_with(2)
     job_of(ledger, range(4), pace=known(2 * SLOW))
     assign_all(ledger)
@@ -60,7 +60,7 @@ def test_nothing_is_asked_for_while_something_waits() -> None:
     assert ledger.recall(1.0) == []
 
 
-def test_an_empty_answer_to_a_recall_changes_nothing() -> None:
+def test_an_empty_answer_to_a_recall_changes_no_task() -> None:
     ledger, (worker, _) = ledger_with(2)
     job_of(ledger, range(4))
     assign_all(ledger)
@@ -137,7 +137,7 @@ def test_items_of_unfinished_tasks() -> None:
     assert sorted(ledger.unfinished(job)) == ["b", "c", "d", "p", "q"]
 
 
-def test_an_expired_task_is_done_and_its_worker_is_given_nothing() -> None:
+def test_an_expired_task_is_done_and_its_worker_gets_no_more() -> None:
     ledger, (worker,) = ledger_with(1)
     job = job_of(ledger, range(2), alone=True)
     (batch,) = assign_all(ledger)
@@ -243,7 +243,7 @@ def test_without_retries_a_task_runs_once() -> None:
     assert len(job.waiting) == 1
 
 
-def test_a_worker_lost_with_nothing_to_do_costs_nothing() -> None:
+def test_the_loss_of_an_idle_worker_costs_no_attempt() -> None:
     ledger, (worker,) = ledger_with(1)
     assert ledger.lose(worker, (), (1, 0)) == []
     assert ledger.idle() == []
@@ -264,7 +264,7 @@ def test_a_busy_worker_does_not_leave() -> None:
     assert not assign_all(ledger)
 
 
-def test_demand_counts_what_waits_and_what_runs() -> None:
+def test_demand_counts_waiting_and_running_tasks() -> None:
     ledger, (worker,) = ledger_with(1)
     job = job_of(ledger, range(10))
     assign_all(ledger)

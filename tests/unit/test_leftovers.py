@@ -111,7 +111,7 @@ def test_a_process_that_left_its_parents_and_session_is_ended() -> None:
     assert run(LEAVES) == "True\nFalse\n"
 
 
-def test_a_process_that_cannot_be_ended_is_told(
+def test_a_process_that_cannot_be_ended_is_reported(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(main, "_reap", lambda: True)

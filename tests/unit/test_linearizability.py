@@ -124,7 +124,7 @@ def test_it_finds(fault: str) -> None:
     assert not is_linearizable(one_after_another(*operations), model, state)
 
 
-def test_what_overlaps_may_have_happened_in_either_order() -> None:
+def test_overlapping_operations_may_have_happened_in_either_order() -> None:
     put, other = Operation("put", (1,), None, 0, 9), Operation("put", (2,), None, 0, 9)
     for first, second in ((1, 2), (2, 1)):
         gets = [Operation("get", (), first, 10, 11), Operation("get", (), second, 12, 13)]
@@ -132,7 +132,7 @@ def test_what_overlaps_may_have_happened_in_either_order() -> None:
 
 
 @pytest.mark.parametrize("case", ["Lock", "SimpleQueue"])
-def test_it_finds_a_result_that_was_changed_in_what_truly_happened(case: str) -> None:
+def test_it_finds_a_changed_result_in_a_true_history(case: str) -> None:
     target, make, model, state = CASES[case]
     seen = history(target, make())
     gets = [n for n, operation in enumerate(seen) if operation.name in ("get", "acquire")]

@@ -32,7 +32,7 @@ def test_frames_of_all_sizes_cross_both_ways(site: Site) -> None:
         assert notes.frames == frames
 
 
-def test_a_flood_of_small_frames_overflows_nothing(site: Site) -> None:
+def test_a_flood_of_small_frames_causes_no_overflow(site: Site) -> None:
     master, agent = site.pair()
     count = 20_000
     for number in range(count):
@@ -62,7 +62,7 @@ def test_any_thread_may_send(site: Site) -> None:
         assert own == [b"%d %d" % (name, number) for number in range(300)]
 
 
-def test_each_side_learns_who_the_other_is(site: Site) -> None:
+def test_each_side_learns_the_identity_of_the_other(site: Site) -> None:
     master, agent = site.pair()
     assert master.link.peer == Identity.of_this_process("agent-1", "uid", host="here")
     assert agent.link.peer.name == "the master"
@@ -86,7 +86,7 @@ def test_many_agents_share_one_socket(site: Site) -> None:
 
 @pytest.mark.parametrize("break_off", [break_connections, MasterListener.break_connections])
 @pytest.mark.parametrize("times", [1, 5])
-def test_a_broken_connection_loses_and_repeats_nothing(
+def test_a_broken_connection_neither_loses_nor_repeats_a_frame(
     site: Site, times: int, break_off: Callable[[MasterListener], None]
 ) -> None:
     # nng may not notice the break; then the agent's suspicion makes it dial again.
@@ -121,7 +121,7 @@ def test_a_master_that_began_anew_refuses_the_old_session(site: Site) -> None:
     assert "'agent-1' is not known here" in successor.refusals[0]
 
 
-def test_close_tells_the_other_side_why(site: Site) -> None:
+def test_close_gives_the_other_side_the_reason(site: Site) -> None:
     listener, master = site.listener()
     _, agent = site.dialer(listener.address)
     master.link.send(b"last words")

@@ -185,7 +185,7 @@ def test_an_attack_on_the_handshake_ends_it(
         assert master.frames == [b"in order"]
 
 
-def test_a_whole_conversation_replayed_is_nobody(site: Site, path_of: Any) -> None:
+def test_a_replayed_conversation_is_refused(site: Site, path_of: Any) -> None:
     once = Once(lambda _: False, lambda *_: [])
     path, listener, master = path_of(once)
     talk(site, path, listener, master)
@@ -201,7 +201,7 @@ def test_a_whole_conversation_replayed_is_nobody(site: Site, path_of: Any) -> No
     assert master.frames == FRAMES
 
 
-def test_two_connections_have_nothing_in_common(site: Site, path_of: Any) -> None:
+def test_a_frame_is_sealed_anew_on_each_connection(site: Site, path_of: Any) -> None:
     """Send again on a new connection: the message is sealed anew."""
     once = Once(lambda unit: unit.kind == MESSAGE and unit.number == 4, lambda *_: [CUT])
     path, listener, master = path_of(once)
@@ -263,7 +263,7 @@ def test_a_proof_is_good_for_one_master_alone(site: Site) -> None:
 
 @pytest.mark.filterwarnings("ignore:ssl.TLSVersion:DeprecationWarning")
 @pytest.mark.parametrize("who", ["agent", "master"])
-def test_nobody_is_talked_into_an_older_tls(
+def test_no_side_accepts_an_older_tls(
     site: Site, monkeypatch: pytest.MonkeyPatch, who: str
 ) -> None:
     def older(*credentials: Any) -> ssl.SSLContext:

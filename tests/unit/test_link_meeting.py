@@ -34,7 +34,7 @@ def test_an_address_that_is_not_ours_is_named(site: Site, address: str) -> None:
 
 
 @pytest.mark.parametrize("address", ["localhost", ":80", "localhost:http", "localhost:65536"])
-def test_what_is_no_address_is_refused(site: Site, address: str) -> None:
+def test_an_invalid_address_is_refused(site: Site, address: str) -> None:
     with pytest.raises(ConfigError, match="is no address"):
         site.listener(address)
     with pytest.raises(ConfigError, match="is no address"):
@@ -49,7 +49,7 @@ def test_a_master_that_comes_later_is_found(site: Site) -> None:
     master.wait(lambda: master.frames == [b"found you"])
 
 
-def test_where_nobody_listens_the_dialer_gives_up(site: Site) -> None:
+def test_the_dialer_gives_up_without_a_listener(site: Site) -> None:
     address = f"127.0.0.1:{free_port()}"
     _, agent = site.dialer(address, timeout=0.3)
     agent.wait(lambda: agent.errors)
@@ -84,7 +84,7 @@ def test_where_there_is_no_thread_for_a_moment_it_is_tried_again(
     assert refusals == []
 
 
-def test_what_takes_connections_and_says_nothing_is_given_up(site: Site) -> None:
+def test_the_dialer_gives_up_on_a_silent_server(site: Site) -> None:
     with socket.create_server(("127.0.0.1", 0)) as silent:
         address = f"127.0.0.1:{silent.getsockname()[1]}"
         _, agent = site.dialer(address, timeout=0.3)
@@ -170,7 +170,7 @@ def test_wrong_credentials_are_an_error_at_once(site: Site, wrong: str) -> None:
     assert master.links == master.proofs == []
 
 
-def test_one_who_knows_the_key_of_a_pool_cannot_pose_as_its_only_master(site: Site) -> None:
+def test_the_key_of_a_pool_does_not_suffice_to_pose_as_its_only_master(site: Site) -> None:
     impostor = Site(replace(make_credentials(), pool_key=site.credentials.pool_key))
     try:
         listener, _ = impostor.listener()
@@ -247,7 +247,7 @@ def test_an_agent_that_comes_before_its_pod_is_known_waits_for_it(site: Site) ->
     assert agent.link is not master.link
 
 
-def test_an_agent_that_is_not_the_pod_that_it_says_hears_why(site: Site) -> None:
+def test_an_agent_with_the_name_of_another_pod_gets_the_reason(site: Site) -> None:
     listener, master = site.listener()
     listener._knows = lambda identity: f"{identity.uid!r} is no pod"
     _, agent = site.dialer(listener.address)
@@ -272,7 +272,7 @@ def test_a_master_of_an_earlier_epoch_is_refused(site: Site) -> None:
         ({"python": "3.1.4"}, "Python", "3.1.4"),
     ],
 )
-def test_another_version_is_refused_and_both_sides_hear_both(
+def test_another_version_is_refused_and_both_sides_get_both_versions(
     site: Site, change: dict[str, Any], what: str, theirs: str
 ) -> None:
     listener, master = site.listener()
@@ -298,7 +298,7 @@ def test_another_patch_level_of_python_will_do(site: Site) -> None:
     assert agent.link is not master.link
 
 
-def test_who_is_no_agent_is_refused(site: Site) -> None:
+def test_a_client_that_is_no_agent_is_refused(site: Site) -> None:
     listener, master = site.listener()
     with pytest.raises(authentication.PeerClosed):
         say(listener.address, site.credentials.agent("a", "uid"), b"GET / HTTP/1.1")
@@ -306,6 +306,6 @@ def test_who_is_no_agent_is_refused(site: Site) -> None:
     assert "no agent of Fiber" in master.refusals[0]
 
 
-def test_a_greeting_carries_nothing_but_who_and_where() -> None:
+def test_a_greeting_carries_only_identity_and_place() -> None:
     hello = AgentHello(Identity.of_this_process("agent-1", "uid"), "session", 3, True)
     assert b"PRIVATE" not in hello.encode()

@@ -89,7 +89,7 @@ def test_one_at_a_time(make: Callable[[], Any]) -> None:
 
 
 @pytest.mark.parametrize("make", [fiber.Lock, fiber.RLock, fiber.Condition])
-def test_what_is_no_time_is_refused_by_a_free_lock_too(make: Callable[[], Any]) -> None:
+def test_an_invalid_timeout_is_refused_by_a_free_lock_too(make: Callable[[], Any]) -> None:
     lock = make()
     with pytest.raises(TypeError, match="must be real number, not str"):
         lock.acquire(timeout="a")
@@ -98,7 +98,7 @@ def test_what_is_no_time_is_refused_by_a_free_lock_too(make: Callable[[], Any]) 
     assert lock.acquire(timeout=1)
 
 
-def test_a_lock_says_who_has_it() -> None:
+def test_a_lock_names_its_holder() -> None:
     lock = fiber.Lock()
     assert repr(lock) == "<Lock(owner=None)>"
     with lock as acquired:
@@ -128,7 +128,7 @@ def add(lock: Any, count: Any, times: int) -> None:
             count.put(count.get() + 1)
 
 
-def test_who_waits_gets_it() -> None:
+def test_a_waiter_gets_the_lock() -> None:
     lock, count = fiber.Lock(), fiber.SimpleQueue()
     count.put(0)
     processes = [fiber.Process(target=add, args=(lock, count, 100)) for _ in range(3)]
@@ -151,7 +151,7 @@ def test_pickled_anywhere_it_is_the_same() -> None:
 # Holders that die
 
 
-def test_what_a_dead_process_holds_is_released(one: SharedSemaphore) -> None:
+def test_tokens_of_a_dead_process_are_released(one: SharedSemaphore) -> None:
     in_fork(one.acquire)
     with pytest.warns(RuntimeWarning, match=r"MainProcess \(pid \d+\) ended while it held"):
         acquired = one.acquire(timeout=PATIENCE)
@@ -162,7 +162,7 @@ def test_what_a_dead_process_holds_is_released(one: SharedSemaphore) -> None:
     assert one.acquire() is True, "only the first one is told"
 
 
-def test_whoever_does_not_wait_gets_it_as_well(one: SharedSemaphore) -> None:
+def test_an_acquire_without_waiting_gets_it_too(one: SharedSemaphore) -> None:
     in_fork(one.acquire)
     with pytest.warns(RuntimeWarning, match="ended"):
         assert one.acquire(False)
@@ -204,7 +204,7 @@ def test_all_that_it_had_is_released() -> None:
     assert semaphore._get_value() == 2
 
 
-def test_what_the_living_hold_is_not() -> None:
+def test_tokens_of_the_living_are_not_released() -> None:
     semaphore = shared_blocks.create_semaphore(COUNTING, 2, 2)
     semaphore.acquire()
     in_fork(semaphore.acquire)
@@ -221,7 +221,7 @@ def test_a_semaphore_that_carries_signals_is_not_revived() -> None:
     assert not semaphore.acquire(timeout=2 * module.SLICE)
 
 
-def test_more_tokens_than_can_be_told_apart() -> None:
+def test_more_tokens_than_can_be_distinguished() -> None:
     semaphore = shared_blocks.create_semaphore(COUNTING, 1000, SEM_VALUE_MAX)
     assert all(semaphore.acquire(False) is True for _ in range(1000))
     assert not semaphore.acquire(False)
@@ -246,7 +246,7 @@ def test_the_slots_of_the_dead_are_used_again(monkeypatch: pytest.MonkeyPatch) -
     assert not semaphore._words[module._IS_UNTRACKED]
 
 
-def test_a_fork_has_nothing_of_what_its_parent_has(one: SharedSemaphore) -> None:
+def test_a_fork_holds_no_token_of_its_parent(one: SharedSemaphore) -> None:
     one.acquire()
     in_fork(one.release if one.kind == COUNTING else (lambda: None))
     assert one._get_value() == (one.kind == COUNTING)
@@ -257,9 +257,7 @@ def test_a_fork_has_nothing_of_what_its_parent_has(one: SharedSemaphore) -> None
 
 @pytest.mark.parametrize("call", ["_take", "_give"])
 @pytest.mark.parametrize("again", [False, True])
-def test_ctrl_c_after_a_step_costs_nobody_a_token(
-    one: SharedSemaphore, call: str, again: bool
-) -> None:
+def test_ctrl_c_after_a_step_loses_no_token(one: SharedSemaphore, call: str, again: bool) -> None:
     if again:  # the first time it goes the longer way
         take_turn(one)
     step = getattr(one, call)

@@ -72,7 +72,7 @@ def test_the_level_of_the_configuration(backend: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_nothing_is_shown_unless_asked_for(tmp_path: Path) -> None:
+def test_no_record_is_shown_by_default(tmp_path: Path) -> None:
     assert run(tmp_path) == []
     assert run(tmp_path, FIBER_LOG_LEVEL="ERROR") == []
 
@@ -125,7 +125,7 @@ def test_the_logger_has_handlers_of_its_users(records: list[str]) -> None:
     assert records == ["agent a has joined"]
 
 
-def test_a_handler_that_raises_is_shown_and_harms_nobody(
+def test_a_handler_that_raises_is_shown_and_harms_no_caller(
     records: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     class Faulty(logging.Handler):

@@ -114,7 +114,7 @@ def test_calls_that_ask_for_more_calls_do_not_keep_descriptors_waiting(
     loop.unregister(pipe[0])
 
 
-def test_a_reader_hears_data_and_the_end(loop: Loop, pipe: tuple[int, int]) -> None:
+def test_a_reader_gets_data_and_the_end(loop: Loop, pipe: tuple[int, int]) -> None:
     heard: list[bytes] = []
     ended = threading.Event()
 
@@ -131,9 +131,7 @@ def test_a_reader_hears_data_and_the_end(loop: Loop, pipe: tuple[int, int]) -> N
     assert heard == [b"data", b""]
 
 
-def test_what_was_asked_for_before_something_happened_is_done_first(
-    loop: Loop, pipe: tuple[int, int]
-) -> None:
+def test_earlier_requests_run_before_later_events(loop: Loop, pipe: tuple[int, int]) -> None:
     """Register an expectation with ``call_soon``, then cause the event: the order is kept."""
     reading, writing = pipe
     seen: list[str] = []
@@ -225,7 +223,7 @@ def test_a_descriptor_that_a_callback_forgot_is_not_called_in_the_same_round(loo
         os.close(fd)
 
 
-def test_an_error_in_a_callback_is_shown_and_stops_nothing(
+def test_an_error_in_a_callback_is_shown_and_does_not_stop_the_loop(
     loop: Loop, pipe: tuple[int, int], complaints: list[BaseException]
 ) -> None:
     def broken(*_: Any) -> None:
@@ -274,7 +272,7 @@ def test_one_whose_thread_could_not_be_started_can_be_stopped(
     assert len(os.listdir("/proc/self/fd")) == before
 
 
-def test_a_call_after_the_end_writes_into_nobody_elses_descriptor() -> None:
+def test_a_call_after_the_end_writes_into_no_foreign_descriptor() -> None:
     loop = Loop()
     loop.start_thread("short")
     loop.stop()
@@ -328,7 +326,7 @@ class Dependent:
         self.error = error
 
 
-def test_who_depends_on_it_is_told_if_it_fails() -> None:
+def test_dependents_learn_that_the_loop_failed() -> None:
     loop = Loop()
     dependent, forgotten = Dependent(), Dependent()
     loop.depend(dependent)

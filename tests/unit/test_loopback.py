@@ -83,7 +83,7 @@ def test_processes_go_to_the_agent_that_has_the_fewest(shared: Any) -> None:
     stop(*children)
 
 
-def test_more_than_the_agents_may_run_is_an_error_that_says_what_to_raise(shared: Any) -> None:
+def test_exceeding_the_agents_capacity_names_the_setting_to_raise(shared: Any) -> None:
     children = [start() for _ in range(4)]
     with pytest.raises(StartError, match="all 2 agents run 2 processes already") as caught:
         start()
@@ -92,7 +92,7 @@ def test_more_than_the_agents_may_run_is_an_error_that_says_what_to_raise(shared
     stop(start())
 
 
-def test_nothing_secret_is_on_a_command_line_or_in_the_environment_of_children(
+def test_no_secret_is_on_a_command_line_or_in_the_environment_of_children(
     shared: Any, capfd: pytest.CaptureFixture[str]
 ) -> None:
     child = start()
@@ -150,7 +150,7 @@ def print_both() -> None:
     print("to stderr", file=sys.stderr)
 
 
-def test_what_children_write_reaches_stderr_with_their_names(
+def test_output_of_children_reaches_stderr_with_their_names(
     shared: Any, capfd: pytest.CaptureFixture[str]
 ) -> None:
     child = fiber.Process(target=print_both, name="writer")
@@ -207,7 +207,7 @@ def test_agents_that_die_before_they_join_are_an_error_until_one_joins(
 
 
 @pytest.mark.slow
-def test_agents_that_are_killed_while_they_start_cost_a_pool_nothing_but_time() -> None:
+def test_agents_that_are_killed_while_they_start_only_delay_a_pool() -> None:
     with running() as backend, fiber.Pool(1) as pool:
         assert pool.map(abs, range(3)) == [0, 1, 2]
         killed: set[int | None] = {None}
@@ -393,7 +393,7 @@ def test_while_another_agent_is_there_no_place_is_given_up(
     assert capfd.readouterr().err.count("no loopback agent has joined for") == 1
 
 
-def test_a_port_in_use_is_named_and_leaves_nothing() -> None:
+def test_a_port_in_use_is_named_and_leaves_no_process() -> None:
     before = len(os.listdir("/proc/self/fd"))
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
@@ -448,7 +448,7 @@ def test_agents_that_do_not_answer_share_one_deadline_at_the_end(
     assert waits == [loopback._QUIT_TIMEOUT, 0.0, 0.0]
 
 
-def test_who_hangs_up_while_it_ends_is_not_reported(
+def test_a_client_that_disconnects_during_the_end_is_not_reported(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     with running() as backend:
@@ -507,7 +507,7 @@ def remote() -> tuple[RemoteAgent, Silent, Recorder]:
     return agent, link, observer
 
 
-def test_what_comes_late_from_a_lost_agent_is_dropped(remote: Any) -> None:
+def test_late_messages_of_a_lost_agent_are_dropped(remote: Any) -> None:
     agent, _, observer = remote
     agent.on_frame(messages.Started(1, 77).encode())
     agent.on_frame(messages.FromChild(1, pickle.dumps("in time"), ()).encode())
@@ -520,7 +520,7 @@ def test_what_comes_late_from_a_lost_agent_is_dropped(remote: Any) -> None:
     assert observer.report.exitcode == -signal.SIGKILL
 
 
-def test_nothing_is_delivered_to_a_child_whose_agent_is_lost(remote: Any) -> None:
+def test_a_child_of_a_lost_agent_gets_no_message(remote: Any) -> None:
     agent, _, observer = remote
     (child,) = agent._children.values()
     agent.on_lost("silence")

@@ -62,7 +62,7 @@ def test_each_part_that_fails_is_named(
     assert (f"test-side-by-side: failed:{failed}\n" in errors) == bool(failed)
 
 
-def test_the_part_in_the_background_hears_an_interrupt(tmp_path: Path) -> None:
+def test_the_part_in_the_background_gets_an_interrupt(tmp_path: Path) -> None:
     with side_by_side(tmp_path, SHOWS_SIGINT, "true") as make:
         output, _ = make.communicate(timeout=PATIENCE)
     assert "default_int_handler" in output

@@ -65,7 +65,7 @@ def test_proxies_are_multiprocessings(manager: Any) -> None:
     assert isinstance(manager.Lock(), multiprocessing.managers.BaseProxy)
 
 
-def test_what_is_in_a_proxy_can_be_a_proxy(manager: Any) -> None:
+def test_an_element_of_a_proxy_can_be_a_proxy(manager: Any) -> None:
     objects = manager._number_of_objects()
     outer = manager.list([manager.dict(a=1), manager.list()])
     outer[0]["b"] = 2
@@ -150,7 +150,7 @@ def test_an_error_comes_as_it_is_and_says_where_it_was(manager: Any) -> None:
     assert "Traceback" in str(caught.value.__cause__)
 
 
-def test_what_does_not_travel_is_an_error_of_the_call_alone() -> None:
+def test_an_argument_that_cannot_be_pickled_is_only_an_error_of_the_call() -> None:
     with CounterManager() as manager:
         counter = manager.Counter()
         with pytest.raises(RemoteError, match=r"cannot pickle '_thread.lock' object"):
@@ -187,7 +187,7 @@ def test_an_object_lives_as_long_as_any_process_has_a_proxy(manager: Any) -> Non
     assert wait_until(lambda: manager._number_of_objects() == objects, PATIENCE)
 
 
-def test_what_a_result_holds_lives_until_its_caller_has_it(manager: Any) -> None:
+def test_objects_in_a_result_live_until_the_caller_has_them(manager: Any) -> None:
     outer = manager.list([manager.dict(a=1)])
     for _ in range(50):
         part = outer.pop()
@@ -229,7 +229,7 @@ def acquire_and_die(lock: Any) -> None:
     os._exit(3)
 
 
-def test_who_makes_an_error_of_the_warning_does_not_have_the_lock(manager: Any) -> None:
+def test_a_warning_turned_into_an_error_releases_the_lock(manager: Any) -> None:
     lock = manager.Lock()
     child = fiber.Process(target=acquire_and_die, args=(lock,))
     child.start()
@@ -244,7 +244,7 @@ def test_who_makes_an_error_of_the_warning_does_not_have_the_lock(manager: Any) 
 # Ctrl-C
 
 
-def test_an_item_that_nobody_waits_for_any_more_is_the_next_ones(
+def test_an_item_whose_waiter_gave_up_goes_to_the_next(
     manager: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     queue = manager.Queue()
@@ -260,7 +260,7 @@ def interrupt(_channel: CallChannel) -> None:
     raise KeyboardInterrupt
 
 
-def test_what_had_come_when_its_call_was_interrupted_is_the_next_ones(
+def test_an_item_of_an_interrupted_call_goes_to_the_next(
     manager: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupt_late(channel: CallChannel) -> None:
@@ -280,7 +280,7 @@ def test_what_had_come_when_its_call_was_interrupted_is_the_next_ones(
     assert condition.acquire(True, PATIENCE)
 
 
-def test_an_interruption_takes_nothing_of_an_earlier_call_back(
+def test_an_interruption_does_not_undo_an_earlier_call(
     manager: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     queue = manager.Queue()
@@ -327,7 +327,7 @@ def struck(error: type[BaseException]) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("kind", ["RLock", "Condition"])
-def test_who_has_a_lock_has_it_still_after_another_call_was_interrupted(kind: str) -> None:
+def test_a_lock_is_kept_after_another_call_was_interrupted(kind: str) -> None:
     with SlowManager() as manager:
         lock, slow, go_on = getattr(manager, kind)(), manager.Slow(), fiber.Event()
         with struck(KeyboardInterrupt), lock:
@@ -400,7 +400,7 @@ def connect_and_make(address: Any, shared: Any) -> None:
     shared["made"] = list(manager.list([1, 2]))
 
 
-def test_an_address_does_not_show_what_lets_one_in(manager: Any) -> None:
+def test_an_address_does_not_show_the_key(manager: Any) -> None:
     who = r"manager 'SyncManager-\d+' \(pid \d+ on host 'local'\)"
     assert re.fullmatch(f"<address of {who}>", repr(manager.address))
 

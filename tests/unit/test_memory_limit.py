@@ -29,7 +29,7 @@ def kills(group: Path, count: int) -> None:
     (group / "memory.events").write_text(f"low 0\noom 9\noom_kill {count}\noom_group_kill 0\n")
 
 
-def test_each_kill_is_told_once(group: Path) -> None:
+def test_each_kill_is_reported_once(group: Path) -> None:
     kills(group, 3)
     limit = limit_of(group)
     assert not limit.was_exceeded()
@@ -65,7 +65,7 @@ def test_the_first_version_of_control_groups_counts_too(tmp_path: Path) -> None:
     assert limit.describe() == "its memory limit is 160Mi"
 
 
-def test_where_nothing_is_counted_nobody_is_blamed(tmp_path: Path) -> None:
+def test_without_counters_no_kill_is_reported(tmp_path: Path) -> None:
     limit = MemoryLimit(str(tmp_path), str(tmp_path / "nothing"))
     assert not limit.was_exceeded()
     assert limit.describe() == "its container has no memory limit"

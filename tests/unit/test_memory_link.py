@@ -100,7 +100,7 @@ def test_an_idle_link_lives(loop: SimulatedLoop) -> None:
     assert cable.agent.statistics().datagrams_sent < 340, "a heartbeat each three seconds"
 
 
-def test_a_silent_peer_is_suspect_and_then_lost(loop: SimulatedLoop) -> None:
+def test_a_silent_peer_is_first_suspect_and_then_lost(loop: SimulatedLoop) -> None:
     cable = Cable(loop)
     notes = Notes(cable.master)
     loop.run_for(10)
@@ -112,7 +112,7 @@ def test_a_silent_peer_is_suspect_and_then_lost(loop: SimulatedLoop) -> None:
     assert "nothing was heard for 1" in notes.events[1]
 
 
-def test_what_comes_after_the_loss_is_dropped(loop: SimulatedLoop) -> None:
+def test_messages_after_the_loss_are_dropped(loop: SimulatedLoop) -> None:
     cable = Cable(loop)
     notes, of_agent = Notes(cable.master), Notes(cable.agent)
     cable.cut()
@@ -127,7 +127,7 @@ def test_what_comes_after_the_loss_is_dropped(loop: SimulatedLoop) -> None:
     assert [event[:4] for event in of_agent.events] == ["susp", "lost"]
 
 
-def test_a_cut_that_ends_in_time_costs_nothing(loop: SimulatedLoop) -> None:
+def test_a_cut_that_ends_in_time_loses_no_frame(loop: SimulatedLoop) -> None:
     cable = Cable(loop)
     notes = Notes(cable.master)
     cable.agent.send(b"before")
@@ -142,7 +142,7 @@ def test_a_cut_that_ends_in_time_costs_nothing(loop: SimulatedLoop) -> None:
     assert notes.frames == [b"before", b"meanwhile"]
 
 
-def test_a_process_that_did_not_run_blames_nobody(loop: SimulatedLoop) -> None:
+def test_a_process_that_did_not_run_does_not_count_silence(loop: SimulatedLoop) -> None:
     cable = Cable(loop)
     notes = Notes(cable.master)
     loop.run_for(1)
@@ -151,7 +151,7 @@ def test_a_process_that_did_not_run_blames_nobody(loop: SimulatedLoop) -> None:
     assert notes.events == []
 
 
-def test_close_lets_what_was_sent_arrive_and_says_why(loop: SimulatedLoop) -> None:
+def test_close_delivers_earlier_messages_and_gives_the_reason(loop: SimulatedLoop) -> None:
     cable = Cable(loop, delay=(0.01, 0.02))
     notes, own = Notes(cable.agent), Notes(cable.master)
     closed: list[float] = []
@@ -186,7 +186,7 @@ def test_both_may_close_at_once(loop: SimulatedLoop) -> None:
     loop.run_until(lambda: closed[-1] == "again", within=0)
 
 
-def test_an_observer_that_closes_hears_nothing_more(loop: SimulatedLoop) -> None:
+def test_an_observer_that_closes_gets_no_more_calls(loop: SimulatedLoop) -> None:
     cable = Cable(loop)
 
     class Quitter(Notes):
@@ -242,7 +242,7 @@ def test_a_peer_that_talks_nonsense_is_lost(loop: SimulatedLoop) -> None:
     assert notes.events == ["lost: it broke the protocol: a datagram is of unknown kind 110"]
 
 
-def test_what_is_sent_after_the_end_is_not_kept(loop: SimulatedLoop) -> None:
+def test_messages_after_the_end_are_not_kept(loop: SimulatedLoop) -> None:
     cable = Cable(loop)
     cable.master.close()
     loop.run_for(1)
@@ -292,7 +292,7 @@ def test_small_frames_pass_a_large_one_also_over_connections_that_break(
     assert not notes.events
 
 
-def test_a_peer_that_is_lost_leaves_nothing_of_a_large_frame(loop: SimulatedLoop) -> None:
+def test_a_lost_peer_leaves_no_part_of_a_large_frame(loop: SimulatedLoop) -> None:
     cable = Cable(loop, delay=(0.01, 0.01))
     notes = Notes(cable.master)
     cable.agent.send(bytes(20_000_000), lane="one")

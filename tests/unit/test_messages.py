@@ -84,7 +84,7 @@ def test_there_and_back(message: LinkMessage) -> None:
 
 
 @given(messages, st.data())
-def test_a_damaged_frame_raises_nothing_but_protocol_error(
+def test_a_damaged_frame_raises_only_protocol_error(
     message: LinkMessage, draw: st.DataObject
 ) -> None:
     frame = bytearray(message.encode())
@@ -99,7 +99,7 @@ def test_a_damaged_frame_raises_nothing_but_protocol_error(
 
 
 @given(st.integers(0, 20), data)
-def test_noise_of_any_kind_raises_nothing_but_protocol_error(kind: int, noise: bytes) -> None:
+def test_noise_of_any_kind_raises_only_protocol_error(kind: int, noise: bytes) -> None:
     try:
         decode(bytes([PROTOCOL, kind]) + noise)
     except ProtocolError:
@@ -139,7 +139,7 @@ def test_noise_of_any_kind_raises_nothing_but_protocol_error(kind: int, noise: b
         ),
     ],
 )
-def test_an_error_names_what_is_wrong(frame: bytes, complaint: str) -> None:
+def test_an_error_names_the_fault(frame: bytes, complaint: str) -> None:
     with pytest.raises(ProtocolError, match=complaint):
         decode(frame)
 

@@ -199,7 +199,7 @@ class TestPickle:
         assert resources_of(back) == resources_of(original)
 
     @pytest.mark.parametrize("name", ["decorated", "rebound"])
-    def test_what_owns_its_name_travels_as_that_name(self, library: Any, name: str) -> None:
+    def test_the_owner_of_a_name_is_pickled_as_that_name(self, library: Any, name: str) -> None:
         assert round_trip(getattr(library, name)) is getattr(library, name)
 
     def test_a_shared_function_travels_by_its_own_name(self, library: Any) -> None:
@@ -325,7 +325,7 @@ class TestNodes:
             ({"tolerations": [{"keys": "spot"}]}, "is no toleration"),
         ],
     )
-    def test_what_cannot_be_read_is_an_error(self, wishes: dict[str, Any], why: str) -> None:
+    def test_unreadable_metadata_is_an_error(self, wishes: dict[str, Any], why: str) -> None:
         with pytest.raises(ValueError, match=why):
             meta(**wishes)
 

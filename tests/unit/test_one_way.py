@@ -311,7 +311,7 @@ def test_a_message_too_large_for_the_backlog_waits_for_its_turn(size: int, ends:
     assert got == [*numbers(MORE_THAN_A_SOCKET), bytes(size)]
 
 
-def test_senders_that_wait_hear_that_nobody_can_receive(ends: Ends) -> None:
+def test_waiting_senders_get_the_loss_of_all_receivers(ends: Ends) -> None:
     receiver, sender = ends
     filled(lambda: sender.try_send(b"x" * 40))
     errors: list[BaseException] = []
@@ -328,7 +328,7 @@ def test_senders_that_wait_hear_that_nobody_can_receive(ends: Ends) -> None:
     assert len(errors) == 1
 
 
-def test_a_sender_with_a_backlog_hears_it_at_once(ends: Ends) -> None:
+def test_a_sender_with_a_backlog_gets_it_at_once(ends: Ends) -> None:
     receiver, sender = ends
     overflow(sender)
     receiver.close()

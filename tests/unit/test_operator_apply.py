@@ -161,7 +161,7 @@ async def test_a_creation_that_is_stopped_ends_with_its_batch(
 
 
 @played
-async def test_nothing_is_made_twice_however_late_the_pods_are_seen(
+async def test_no_pod_is_created_twice_however_late_the_list_is(
     api: KubernetesApi, door: Cluster
 ) -> None:
     """Pods are looked at at any time; ten are always wanted."""
@@ -185,7 +185,7 @@ async def test_nothing_is_made_twice_however_late_the_pods_are_seen(
 
 
 @played
-async def test_a_creation_that_is_cancelled_is_unsure_of_what_is_under_way(
+async def test_a_cancelled_creation_marks_its_open_calls_as_unsure(
     api: KubernetesApi, door: Cluster
 ) -> None:
     api.faults.append(Fault("create", "pods", late=0.4, times=10**6, skip=1))
@@ -204,7 +204,7 @@ async def test_a_creation_that_is_cancelled_is_unsure_of_what_is_under_way(
     assert len(api.store.list("pods")) == 10
 
 
-def test_without_the_lease_nothing_is_created() -> None:
+def test_without_the_lease_no_pod_is_created() -> None:
     def refuse() -> float:
         raise NotLeader
 
@@ -239,7 +239,7 @@ async def test_an_event_that_repeats_is_counted(api: KubernetesApi, door: Cluste
 
 
 @played
-async def test_events_are_posted_in_order_and_nobody_waits(
+async def test_events_are_posted_in_order_without_waiting(
     api: KubernetesApi, door: Cluster
 ) -> None:
     record, clock = recorder(api, door), asyncio.get_running_loop().time

@@ -50,7 +50,7 @@ def test_a_master_that_did_not_make_the_pool_does_not_end_it() -> None:
 # -- Released workers
 
 
-def test_a_release_below_the_minimum_deletes_and_creates_nothing() -> None:
+def test_a_release_below_the_minimum_changes_no_pod() -> None:
     release = {"release": [name_of(1), name_of(2)]}
     pool = tried(replicas=1, minReplicas=3, master=MASTER, scaleDown=release)
     made = plan_of(pool, running(1), running(2), running(3))
@@ -79,7 +79,7 @@ def test_a_release_goes_where_the_minimum_is_not_what_keeps_the_worker() -> None
 IDLE = {"master": MASTER, "idle": {"timeoutSeconds": 3600}}
 
 
-def test_a_master_that_asks_for_nothing_for_long_does_not_hold_the_minimum() -> None:
+def test_an_idle_master_does_not_hold_the_minimum() -> None:
     pool = tried(minReplicas=2, **IDLE)
     made = plan_of(pool, running(1), running(2))
     assert made.requeue_at == NOW + 3600
@@ -106,7 +106,7 @@ def test_a_master_that_asks_for_nothing_for_long_does_not_hold_the_minimum() -> 
     [{"replicas": 1}, {"master": {**MASTER, "epoch": 2}}, {"master": None}, {"idle": None}],
     ids=str,
 )
-def test_whoever_asks_for_something_or_comes_anew_holds_the_minimum(change: Json) -> None:
+def test_a_master_with_requests_or_a_new_one_holds_the_minimum(change: Json) -> None:
     status = {"idleSince": format_time(NOW - 9000), "masterEpoch": 1}
     pool = tried(minReplicas=2, **IDLE)
     idle = make_pool({**proven(pool), **status}, minReplicas=2, **IDLE)

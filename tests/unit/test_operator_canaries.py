@@ -58,7 +58,7 @@ def test_canaries_on_their_way_are_joined_by_as_many_again_and_again() -> None:
         (ended(1, ran=4990), 1),
     ],
 )
-def test_canaries_of_which_one_is_in_trouble_stay_few(first: Json, created: int) -> None:
+def test_canaries_stay_few_while_one_is_in_trouble(first: Json, created: int) -> None:
     pool = make_pool(replicas=100, failurePolicy={"startupTimeoutSeconds": 86_400})
     pods = [first, *pulling(range(2, 4), age=5000)]
     seen = with_plan(pool, plan_of(pool, *pods))

@@ -68,7 +68,7 @@ def test_objects_are_made_read_changed_and_deleted() -> None:
     with_api(test)
 
 
-def test_a_list_has_every_page_and_only_what_is_selected() -> None:
+def test_a_list_has_every_page_of_the_selected_objects_only() -> None:
     async def test(api: KubernetesApi, door: Cluster) -> None:
         api.page = 3  # the client asks for no pages; a server may still answer in pages
         for number in range(8):
@@ -107,7 +107,7 @@ def test_an_empty_list_of_metadata_is_empty() -> None:
     with_api(test)
 
 
-def test_a_dry_run_makes_nothing() -> None:
+def test_a_dry_run_creates_no_object() -> None:
     async def test(api: KubernetesApi, door: Cluster) -> None:
         await door.create(PODS, "here", pod("a"), dry_run=True)
         assert api.store.list("pods") == []
@@ -115,7 +115,7 @@ def test_a_dry_run_makes_nothing() -> None:
     with_api(test)
 
 
-def test_what_changed_is_not_deleted() -> None:
+def test_a_changed_object_is_not_deleted() -> None:
     async def test(api: KubernetesApi, door: Cluster) -> None:
         made = (await door.create(PODS, "here", pod("a")))["metadata"]
         with pytest.raises(responses.Conflict):
@@ -183,7 +183,7 @@ def test_nonsense_is_no_answer(text: str, verb: str) -> None:
 
 
 @pytest.mark.parametrize("text", ["{}", '{"metadata": {}}', '{"metadata": {"name": "b"}}'])
-def test_what_is_not_the_object_is_no_answer(text: str) -> None:
+def test_an_answer_that_is_no_object_is_refused(text: str) -> None:
     async def test(api: KubernetesApi, door: Cluster) -> None:
         api.store.create("pods", "here", pod("a"))
         api.faults.append(Fault(text=text, times=4))
@@ -210,7 +210,7 @@ def test_what_is_not_the_object_is_no_answer(text: str) -> None:
         '{"kind": "Status", "metadata": {}, "items": []}',
     ],
 )
-def test_what_is_no_list_is_not_an_empty_one(text: str) -> None:
+def test_an_answer_that_is_no_list_is_not_an_empty_one(text: str) -> None:
     async def test(api: KubernetesApi, door: Cluster) -> None:
         api.faults.append(Fault(text=text))
         with pytest.raises(responses.Unavailable):
@@ -251,7 +251,7 @@ def test_no_server_is_unavailable() -> None:
     virtual_time.run(main())
 
 
-def test_nothing_is_changed_without_permission() -> None:
+def test_no_object_is_changed_without_permission() -> None:
     def forbid() -> float:
         raise PermissionError
 

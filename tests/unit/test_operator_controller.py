@@ -63,7 +63,7 @@ async def test_bad_news_is_in_the_status_within_a_second(world: World) -> None:
 
 
 @played()
-async def test_a_new_pool_is_not_asked_for_what_it_cannot_have_yet(world: World) -> None:
+async def test_a_new_pool_skips_reads_of_later_objects(world: World) -> None:
     world.make_pool(replicas=1)
     await world.ready(1)
     for plural in ("services", "secrets", "endpointslices"):
@@ -168,7 +168,7 @@ async def test_no_more_at_once_than_asked_for(world: World) -> None:
 
 
 @played()
-async def test_a_full_quota_is_told_and_not_stormed(world: World) -> None:
+async def test_a_full_quota_is_reported_without_a_storm_of_calls(world: World) -> None:
     def quota(plural: str, body: Body) -> None:
         if plural == "pods" and len(world.pods()) >= 3:
             message = 'pods "es" is forbidden: exceeded quota: pods, requested: pods=1'
@@ -292,7 +292,7 @@ async def test_a_new_master_is_dialled_within_a_second(world: World) -> None:
 
 
 @played()
-async def test_what_is_deleted_beside_the_pods_comes_back(world: World) -> None:
+async def test_deleted_dependents_are_created_again(world: World) -> None:
     world.make_pool(replicas=2, master=MASTER)
     await world.ready(2)
     for plural in ("services", "secrets", "endpointslices"):
@@ -338,7 +338,7 @@ def test_an_object_of_somebody_else_is_not_touched(plural: str) -> None:
 
 
 @played()
-async def test_a_pool_made_anew_waits_for_what_the_old_one_left(world: World) -> None:
+async def test_a_recreated_pool_waits_for_the_remains_of_the_old_one(world: World) -> None:
     world.make_pool(replicas=2)
     await world.ready(2)
     old = world.store.get("fiberpools", NAMESPACE, "es")["metadata"]["uid"]
@@ -355,7 +355,7 @@ async def test_a_pool_made_anew_waits_for_what_the_old_one_left(world: World) ->
 
 
 @played()
-async def test_damaged_credentials_are_told(world: World) -> None:
+async def test_damaged_credentials_are_reported(world: World) -> None:
     world.make_pool(replicas=1)
     await world.ready(1)
     world.store.merge("secrets", NAMESPACE, "es-fiber-key", {"data": {"key": "bm9uc2Vuc2U="}})
@@ -376,7 +376,7 @@ async def test_damaged_credentials_are_told(world: World) -> None:
         {"template": {"spec": {"containers": []}}},
     ],
 )
-def test_a_spec_that_makes_no_sense_deletes_nothing(spec: Body) -> None:
+def test_an_invalid_spec_deletes_no_pod(spec: Body) -> None:
     """Use a pool of an older or newer schema, as this one refuses it."""
 
     @played()
@@ -422,7 +422,7 @@ def test_nonsense_in_the_status_is_written_over(status: Any) -> None:
 @pytest.mark.parametrize(
     "status", [{}, {"phase": 7, "conditions": "x"}, {"containerStatuses": [None, {"state": 1}]}]
 )
-def test_nonsense_in_a_pod_harms_nobody(status: Any) -> None:
+def test_nonsense_in_a_pod_harms_no_other(status: Any) -> None:
     @played()
     async def test(world: World) -> None:
         world.make_pool(replicas=3, master=MASTER)
@@ -436,7 +436,7 @@ def test_nonsense_in_a_pod_harms_nobody(status: Any) -> None:
 
 
 @played()
-async def test_what_no_event_tells_is_found_within_a_minute(world: World) -> None:
+async def test_changes_without_an_event_are_found_within_a_minute(world: World) -> None:
     world.make_pool(replicas=3)
     await world.ready(3)
     world.deaf = True
@@ -471,7 +471,7 @@ async def test_a_spec_of_too_many_values_is_not_read_and_the_pool_says_so(world:
 
 
 @played()
-async def test_a_pool_that_goes_leaves_nothing_behind(world: World) -> None:
+async def test_a_deleted_pool_leaves_no_object(world: World) -> None:
     world.make_pool(replicas=3, master={**MASTER, "leaseName": "es"})
     await world.ready(3)
     world.store.delete("fiberpools", NAMESPACE, "es")
@@ -534,7 +534,7 @@ async def test_why_a_pod_does_not_start_may_stand_in_its_events(world: World) ->
 
 
 @played()
-async def test_people_see_what_the_operator_does(world: World) -> None:
+async def test_events_show_the_operators_actions(world: World) -> None:
     world.make_pool(replicas=3)
     await world.ready(3)
     world.kubelet.exit(NAMESPACE, world.names()[0], 3)
@@ -548,7 +548,7 @@ async def test_people_see_what_the_operator_does(world: World) -> None:
         assert event["message"]
 
 
-def test_what_workers_write_is_not_in_the_operators_log(caplog: pytest.LogCaptureFixture) -> None:
+def test_output_of_workers_is_not_in_the_operators_log(caplog: pytest.LogCaptureFixture) -> None:
     @played()
     async def test(world: World) -> None:
         world.make_pool(replicas=3)

@@ -189,7 +189,9 @@ def five_workers() -> Store:
 
 
 @pytest.mark.parametrize("name", STORIES)
-def test_a_crash_after_any_call_changes_nothing_in_the_end(name: str, five_workers: Store) -> None:
+def test_a_crash_after_any_call_does_not_change_the_final_state(
+    name: str, five_workers: Store
+) -> None:
     has_past, story = STORIES[name]
     past = five_workers if has_past else None
     calls, disrupted = 1, int(name == "eviction")

@@ -118,7 +118,7 @@ async def test_workers_without_a_master_that_dial_an_old_address_are_replaced(
 
 
 @played
-async def test_workers_of_a_master_that_dial_an_old_address_stay_and_are_told(
+async def test_workers_of_a_master_that_dial_an_old_address_stay_and_are_reported(
     world: World,
 ) -> None:
     world.make_pool(replicas=3, master=MASTER)
@@ -162,7 +162,7 @@ async def test_workers_without_a_master_that_hold_old_credentials_are_replaced(
 
 
 @played
-async def test_workers_of_a_master_that_hold_old_credentials_stay_and_are_told(
+async def test_workers_of_a_master_that_hold_old_credentials_stay_and_are_reported(
     world: World,
 ) -> None:
     world.make_pool(replicas=3, master=MASTER)

@@ -104,7 +104,7 @@ def test_the_templates_that_are_shown_are_spelt_well(path: Path) -> None:
     "metadata",
     [{"creationTimestamp": None}, {"name": "x", "finalizers": ["a"]}, {"managedFields": []}],
 )
-def test_what_a_template_may_hold_without_effect_is_not_refused(metadata: Body) -> None:
+def test_harmless_fields_of_a_template_are_not_refused(metadata: Body) -> None:
     whole = {"apiVersion": "v1", "kind": "Pod", "status": {}, **template(metadata=metadata)}
     body = pod(make_pool(template=whole), "es-0000000001", "10.96.1.2:7070")
     strict.check(body)
@@ -164,7 +164,7 @@ def test_400_blames_the_template_in_a_dry_run_alone(
         ),
     ],
 )
-def test_a_limit_range_is_told_with_what_to_do(status: int, message: str) -> None:
+def test_a_limit_range_is_reported_with_the_remedy(status: int, message: str) -> None:
     refused = PodRefusal("hash", status, message, NOW, dry_run=True)
     told = messages.refusal(refused.reason, refused)
     assert message.partition(": ")[2] in told
@@ -178,7 +178,7 @@ def test_a_refusal_for_something_else_speaks_of_no_limit_range() -> None:
 
 
 @played
-async def test_what_a_webhook_refuses_of_a_good_template_is_tried_again(world: World) -> None:
+async def test_a_webhooks_refusal_of_a_good_template_is_tried_again(world: World) -> None:
     """400 is a webhook's usual answer; the dry run was accepted."""
     world.make_pool(replicas=1)
     await world.ready(1)
@@ -226,7 +226,7 @@ async def test_a_webhook_that_cannot_do_dry_runs_is_no_verdict(world: World) -> 
 
 
 @played
-async def test_a_full_quota_says_nothing_about_a_new_template(world: World) -> None:
+async def test_a_full_quota_does_not_judge_a_new_template(world: World) -> None:
     def quota(plural: str, body: Body) -> None:
         if plural == "pods" and len(world.pods()) >= 4:
             raise Failure(403, "Forbidden", 'pods "es-x" is forbidden: exceeded quota: pods')
@@ -242,7 +242,7 @@ async def test_a_full_quota_says_nothing_about_a_new_template(world: World) -> N
 
 
 @played
-async def test_a_new_pool_is_pending_while_nobody_judges_its_template(world: World) -> None:
+async def test_a_new_pool_is_pending_until_its_template_is_judged(world: World) -> None:
     world.api.faults.append(Fault("create", "pods", status=500, times=3))
     world.make_pool(replicas=2)
     await world.until(lambda: world.status().get("phase") is not None)

@@ -135,7 +135,7 @@ def test_every_right_is_in_one_of_these_tests() -> None:
 
 
 @pytest.mark.parametrize("right", LIVES, ids=" ".join)
-def test_a_right_that_is_missing_is_told_in_the_status(right: Right) -> None:
+def test_a_missing_right_is_reported_in_the_status(right: Right) -> None:
     @played
     async def test(world: World) -> None:
         world.make_pool(replicas=2, master=MASTER)
@@ -178,7 +178,7 @@ def test_without_a_right_to_pods_the_operator_is_not_ready_and_pools_say_why(rig
 
 
 @pytest.mark.parametrize("right", BY_EVENT, ids=" ".join)
-def test_a_status_that_may_not_be_written_is_told_by_an_event(right: Right) -> None:
+def test_a_status_that_may_not_be_written_is_reported_by_an_event(right: Right) -> None:
     @played
     async def test(world: World) -> None:
         world.api.faults.append(denied(right))
@@ -194,7 +194,7 @@ def test_a_status_that_may_not_be_written_is_told_by_an_event(right: Right) -> N
 
 
 @pytest.mark.parametrize("right", BY_LOG, ids=" ".join)
-def test_a_pool_that_may_not_be_read_is_told_in_the_log(
+def test_a_pool_that_may_not_be_read_is_reported_in_the_log(
     right: Right, caplog: pytest.LogCaptureFixture
 ) -> None:
     @played
@@ -331,7 +331,7 @@ def test_a_pool_that_worked_and_whose_pods_cannot_be_made_says_so(way: str) -> N
     [right for right in LIVES if right not in [("create", "pods"), ("get", "leases")]],
     ids=" ".join,
 )
-def test_a_call_that_fails_is_told_in_the_status(right: Right) -> None:
+def test_a_failed_call_is_reported_in_the_status(right: Right) -> None:
     @played
     async def test(world: World) -> None:
         world.make_pool(replicas=2, master=MASTER)
@@ -357,7 +357,7 @@ def test_a_call_that_fails_is_told_in_the_status(right: Right) -> None:
 
 
 @played
-async def test_nothing_is_planned_on_an_unknown_list_of_pods(world: World) -> None:
+async def test_no_plan_is_made_on_an_unknown_list_of_pods(world: World) -> None:
     world.make_pool(replicas=3)
     await world.ready(3)
     world.api.faults.append(fault(("list", "pods"), status=500))

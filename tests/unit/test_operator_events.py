@@ -36,7 +36,7 @@ def reasons(made: Plan) -> list[str]:
     return [str(event.reason) for event in made.events]
 
 
-def test_what_is_done_is_told() -> None:
+def test_actions_are_reported() -> None:
     pool = make_pool(replicas=3, master=MASTER, scaleDown={"release": [name_of(1)]})
     made, _ = look(pool, running(1), of_template("older", waiting(2, "ErrImagePull")), running(3))
     assert [event.message for event in made.events[:3]] == [
@@ -46,7 +46,7 @@ def test_what_is_done_is_told() -> None:
     ]
 
 
-def test_a_problem_is_told_when_it_comes_and_when_it_gets_worse() -> None:
+def test_a_problem_is_reported_when_it_comes_and_when_it_gets_worse() -> None:
     pool = make_pool(replicas=1)
     pod = waiting(1, "ErrImagePull", "manifest unknown")
     made, pool = look(pool, pod)
@@ -67,7 +67,7 @@ def test_a_warning_that_passes_is_not_a_recovery() -> None:
     assert made.events == ()
 
 
-def test_each_failure_is_told_even_if_the_problem_stays() -> None:
+def test_each_failure_is_reported_even_if_the_problem_stays() -> None:
     pool = make_pool(replicas=1)
     first, pool = look(pool, ended(1))
     assert reasons(first) == ["ContainerFailed"]
@@ -79,7 +79,7 @@ def test_each_failure_is_told_even_if_the_problem_stays() -> None:
 
 
 @pytest.mark.parametrize("limit", [0, 6])
-def test_what_a_worker_wrote_is_in_the_status_alone(limit: int) -> None:
+def test_output_of_a_worker_is_in_the_status_alone(limit: int) -> None:
     pool = make_pool(replicas=1, failurePolicy={"backoffLimit": limit})
     made, pool = look(pool, ended(1, message="password: 1234"))
     assert reasons(made)[-1] == "ContainerFailed"
@@ -94,7 +94,7 @@ def test_what_a_worker_wrote_is_not_why_it_was_disrupted() -> None:
     assert "password" not in str(made.events)
 
 
-def test_disruptions_are_told_together() -> None:
+def test_disruptions_are_reported_together() -> None:
     pool = make_pool(replicas=2)
     drained = condition("DisruptionTarget", "True", reason="EvictionByEvictionAPI")
     pods = [terminating(ended(number, conditions=[drained])) for number in (1, 2)]
@@ -106,7 +106,7 @@ def test_disruptions_are_told_together() -> None:
     )
 
 
-def test_a_master_that_comes_and_goes_is_told() -> None:
+def test_a_master_that_comes_and_goes_is_reported() -> None:
     _, pool = look(make_pool(replicas=1, master=MASTER), running(1))
     left = pool.model_copy(update={"spec": pool.spec.model_copy(update={"master": None})})
     made, _ = look(left, running(1))

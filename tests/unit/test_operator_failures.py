@@ -88,7 +88,7 @@ def test_what_fails_during_the_wait_is_of_the_same_wave_and_what_fails_after_it_
     assert third.next_create_time >= NOW + 40
 
 
-def test_nothing_is_counted_twice_and_names_that_are_gone_are_forgotten() -> None:
+def test_no_failure_is_counted_twice_and_old_names_are_forgotten() -> None:
     pods = failed(1), failed(2)
     once = count(Failures(), *pods).failures
     again = count(once, *pods, now=NOW + 4)
@@ -96,7 +96,7 @@ def test_nothing_is_counted_twice_and_names_that_are_gone_are_forgotten() -> Non
     assert count(once).failures.counted == ()
 
 
-def test_what_is_expected_is_not_counted() -> None:
+def test_expected_ends_are_not_counted() -> None:
     found = count(Failures(), failed(1), failed(2), expected={name_of(1), name_of(2)})
     assert (found.failures.total, found.failed) == (0, ())
 
@@ -128,7 +128,7 @@ def test_workers_that_were_ready_before_do_not_unless_no_more_are_wanted() -> No
     assert count(failing(), old, desired=1, now=NOW + 60).failures.waves == 0
 
 
-def test_half_of_what_is_wanted_ready_for_a_minute_keeps_a_pool_from_being_given_up() -> None:
+def test_half_of_the_wanted_workers_ready_for_a_minute_keeps_a_pool_alive() -> None:
     two = ready(1, since=NOW - 60), ready(2, since=NOW - 60)
     last = failing(consecutive=3, next_create_time=NOW - 1)
     assert count(last, *two, failed(3)).failures.consecutive == 0
@@ -159,7 +159,7 @@ def test_a_wave_of_workers_that_had_lived_is_the_first() -> None:
     assert count(last, lived(1), failed(2)).failures.waves == 3
 
 
-def test_in_a_pool_that_is_given_up_nothing_waits() -> None:
+def test_a_pool_that_is_given_up_has_no_waiting_failures() -> None:
     found = count(failing(consecutive=3, next_create_time=NOW - 1), failed(1)).failures
     assert (found.consecutive, found.waiting, found.next_create_time) == (4, 0, None)
     assert count(found, failed(1)).failures == found
@@ -236,7 +236,7 @@ def test_a_wait_that_the_policy_does_not_know_is_none() -> None:
     assert count(failing(next_create_time=NOW - 60)).failures.next_create_time == NOW - 60
 
 
-def test_sums_stay_what_a_status_may_hold() -> None:
+def test_sums_stay_within_the_limits_of_the_status() -> None:
     most = 2**31 - 1
     full = failing(
         **dict.fromkeys(("total", "disrupted", "consecutive", "waves", "waiting"), most),
@@ -266,7 +266,9 @@ def test_a_pod_that_was_late_and_became_ready_is_like_any_other() -> None:
     assert count(kept, failed(1)).failures.total == 2
 
 
-def test_what_has_no_room_in_the_status_is_counted_later(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failures_beyond_the_statuss_room_are_counted_later(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr("fiber_operator.planning.failures.NAMES", 6)
     stuck = [
         view(number, PodState.TERMINATING, trouble=Trouble.DISRUPTED) for number in range(20, 29)

@@ -43,7 +43,7 @@ WAYS: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_a_pool_is_made_whatever_fails(way: str) -> None:
+def test_a_pool_is_created_in_spite_of_any_fault(way: str) -> None:
     """Each kind of call fails twice, then works."""
 
     async def main() -> None:
@@ -167,7 +167,7 @@ def test_a_list_that_is_none_makes_no_pods(text: str) -> None:
 @pytest.mark.parametrize(
     "text", ["{}", '{"metadata": {}}', '{"metadata": {"name": "other", "uid": "1"}}']
 )
-def test_an_answer_that_is_not_the_pool_changes_nothing(text: str) -> None:
+def test_an_answer_that_is_not_the_pool_changes_no_pod(text: str) -> None:
     @played
     async def test(world: World) -> None:
         world.make_pool(replicas=5)
@@ -198,14 +198,14 @@ async def test_a_status_that_cannot_be_written_holds_back_what_it_must_tell(worl
 
 
 @played
-async def test_events_that_cannot_be_posted_hold_back_nothing(world: World) -> None:
+async def test_events_that_cannot_be_posted_delay_no_action(world: World) -> None:
     world.api.faults.append(Fault("create", "events", status=403, times=10**6))
     world.make_pool(replicas=5)
     assert await world.ready(5) < 5
 
 
 @played
-async def test_events_that_are_slow_hold_up_nothing(world: World) -> None:
+async def test_slow_events_delay_no_action(world: World) -> None:
     world.make_pool(replicas=3)
     await world.ready(3)
     world.slow("create", "events", 4.5)
@@ -298,7 +298,7 @@ async def test_sigterm_ends_a_scale_up_between_two_calls(world: World) -> None:
 
 
 @played
-async def test_a_pool_made_anew_in_the_middle_gets_nothing_of_the_old_ones(world: World) -> None:
+async def test_a_pool_recreated_halfway_gets_no_object_of_the_old_one(world: World) -> None:
     """Between the operator's read and its writes the pool is replaced by one of the same name."""
 
     def replace(call: Call) -> None:
@@ -391,7 +391,7 @@ async def test_a_master_that_attaches_during_a_long_deletion_keeps_who_is_left(
 
 
 @played
-async def test_what_is_released_goes_though_the_pool_changes_all_the_time(world: World) -> None:
+async def test_released_pods_go_although_the_pool_changes_all_the_time(world: World) -> None:
     world.make_pool(replicas=5, master=MASTER, update={"strategy": "Recreate"})
     await world.ready(5)
     released = world.names()[2]

@@ -195,7 +195,7 @@ def test_garbage_in_the_status_costs_no_worker(
 
 @settings(deadline=None, max_examples=200, phases=NO_SHRINKING)
 @given(st.sampled_from([ATTACHED, WARM]), st.data(), st.sampled_from([None, True, False]))
-def test_garbage_in_the_spec_can_be_planned_or_is_told(
+def test_garbage_in_the_spec_can_be_planned_or_is_reported(
     document: Body, data: st.DataObject, alive: bool | None
 ) -> None:
     document = spoilt(data.draw, document, ("spec", "spec", "status"))
@@ -257,9 +257,7 @@ def views_of(pool: FiberPool, pods: list[Body]) -> list[PodView]:
 
 @settings(deadline=None, max_examples=200, phases=NO_SHRINKING)
 @given(st.sampled_from([ATTACHED, WARM]), st.data())
-def test_a_worker_goes_for_nothing_that_has_the_wrong_type(
-    document: Body, data: st.DataObject
-) -> None:
+def test_a_value_of_the_wrong_type_removes_no_worker(document: Body, data: st.DataObject) -> None:
     pool = FiberPool.read({**document, "status": {}})
     current = template_hash(pool)
     pods = [of_template(current, running(number)) for number in (10, 11, 12)]
@@ -368,7 +366,9 @@ def test_an_operator_outlives_garbage_in_a_pod(data: st.DataObject) -> None:
 
 @EXAMPLES
 @given(st.data(), st.sampled_from(["services", "endpointslices", "secrets"]))
-def test_an_operator_outlives_garbage_in_what_a_pool_has(data: st.DataObject, plural: str) -> None:
+def test_an_operator_survives_garbage_in_the_objects_of_a_pool(
+    data: st.DataObject, plural: str
+) -> None:
     def spoil(world: World) -> None:
         (body,) = world.store.list(plural, NAMESPACE)
         parts = {key: value for key, value in body.items() if key not in ("metadata", "kind")}

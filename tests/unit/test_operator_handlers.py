@@ -111,7 +111,7 @@ def played(*namespaces: str) -> Callable[[Callable[[Watching], Coroutine[Any, An
 
 
 @played()
-async def test_pools_are_told(kopf: Watching) -> None:
+async def test_pools_are_reported(kopf: Watching) -> None:
     pool = kopf.world.make_pool()
     uid = pool["metadata"]["uid"]
     assert (ES, uid, 1) in await kopf.told(ES)
@@ -134,14 +134,14 @@ async def test_lists_and_watches_ask_for_metadata_alone(kopf: Watching) -> None:
 
 
 @played()
-async def test_what_was_there_before_is_told(kopf: Watching) -> None:
+async def test_existing_pools_are_reported(kopf: Watching) -> None:
     kopf.world.make_pool()
     kopf.world.make_pool("another")
     await kopf.told(ES, Key(NAMESPACE, "another"))
 
 
 @played()
-async def test_renewals_of_the_masters_leases_are_told_and_of_no_others(kopf: Watching) -> None:
+async def test_only_renewals_of_the_masters_leases_are_reported(kopf: Watching) -> None:
     await kopf.watched()
     labels = {"fiber.dev/pool": "es", "fiber.dev/pool-uid": "1"}
     kopf.store.create("leases", NAMESPACE, {"metadata": {"name": "kubernetes"}})
@@ -160,7 +160,7 @@ async def test_renewals_of_the_masters_leases_are_told_and_of_no_others(kopf: Wa
 
 
 @played()
-async def test_kopf_writes_nothing(kopf: Watching) -> None:
+async def test_kopf_writes_no_object(kopf: Watching) -> None:
     marks = {"kopf.zalando.org/last-handled-configuration": "{nonsense"}
     kopf.store.create("fiberpools", NAMESPACE, {"metadata": {"name": "es", "annotations": marks}})
     await kopf.told(ES)
@@ -181,7 +181,7 @@ async def test_only_the_given_namespaces_are_asked_for(kopf: Watching) -> None:
 
 
 @played("one", "two")
-async def test_each_answer_to_kopf_is_told(kopf: Watching) -> None:
+async def test_each_answer_to_kopf_is_reported(kopf: Watching) -> None:
     await kopf.watched(2)
     assert kopf.answers["get /apis/fiber.dev/v1alpha1"] == ""
     assert {what for what in kopf.answers if not what.startswith("get ")} == {
@@ -194,7 +194,7 @@ async def test_each_answer_to_kopf_is_told(kopf: Watching) -> None:
 
 @pytest.mark.parametrize("verb", ["list", "watch"])
 @pytest.mark.parametrize("plural", WATCHED)
-def test_a_right_that_is_missing_is_told_and_so_is_its_return(verb: str, plural: str) -> None:
+def test_a_missing_right_and_its_return_are_reported(verb: str, plural: str) -> None:
     @played()
     async def test(kopf: Watching) -> None:
         said = f'{plural} is forbidden: User "operator" cannot {verb} resource "{plural}"'
@@ -223,7 +223,7 @@ async def test_a_watch_that_breaks_goes_on(kopf: Watching) -> None:
 
 
 @played()
-async def test_after_410_everything_is_told_anew(kopf: Watching) -> None:
+async def test_after_410_all_objects_are_reported_again(kopf: Watching) -> None:
     kopf.world.make_pool()
     await kopf.watched()
     await kopf.told(ES)
@@ -249,7 +249,7 @@ async def test_a_silent_watch_is_given_up(kopf: Watching) -> None:
 
 
 @played()
-async def test_late_events_are_told_late(kopf: Watching) -> None:
+async def test_late_events_are_reported_late(kopf: Watching) -> None:
     await kopf.watched()
     kopf.api.watch_delay = 20
     kopf.world.make_pool()
@@ -295,7 +295,7 @@ def test_an_api_server_in_trouble_is_waited_for(fault: Fault) -> None:
     ],
     ids=lambda fault: f"{fault.verb}-{fault.status or fault.text}",
 )
-def test_what_ends_kopf_does_not_end_watching(fault: Fault) -> None:
+def test_the_end_of_kopf_does_not_end_the_watches(fault: Fault) -> None:
     @played()
     async def test(kopf: Watching) -> None:
         kopf.api.faults.append(fault)

@@ -133,7 +133,7 @@ async def test_the_pool_of_each_pod_that_changes_is_named(site: Site) -> None:
 
 
 @played()
-async def test_the_version_is_the_newest_even_if_nothing_else_changed(site: Site) -> None:
+async def test_the_version_is_the_newest_even_without_other_changes(site: Site) -> None:
     site.make("a")
     await site.names()
     new = site.store.merge("pods", NAMESPACE, "a", {"metadata": {"annotations": {"note": "x"}}})
@@ -223,7 +223,7 @@ async def test_a_list_that_began_earlier_does_not_hide_a_created_pod(site: Site)
 
 
 @played()
-async def test_a_deleted_pod_is_terminating_whatever_the_watch_shows(site: Site) -> None:
+async def test_a_deleted_pod_is_terminating_even_if_the_watch_shows_it_alive(site: Site) -> None:
     site.make("a")
     uid = (await site.views())["a"].uid
     site.store.pods_linger = True
@@ -285,7 +285,7 @@ async def test_a_watch_that_breaks_goes_on_where_it_was(site: Site) -> None:
 
 
 @played()
-async def test_after_410_the_list_says_what_is_gone(site: Site) -> None:
+async def test_after_410_the_list_reveals_deleted_pods(site: Site) -> None:
     site.make("a")
     site.make("b")
     await site.until_there("a", "b")

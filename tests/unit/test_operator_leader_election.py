@@ -108,7 +108,7 @@ async def test_the_first_one_acts_at_once_and_goes_on(found: Operators) -> None:
 
 
 @played
-async def test_before_it_is_known_nobody_acts(found: Operators) -> None:
+async def test_no_operator_acts_before_the_election(found: Operators) -> None:
     found.api.down = True
     elector = found.start("a")
     await asyncio.sleep(60)
@@ -165,7 +165,7 @@ async def test_a_container_that_was_restarted_goes_on_at_once(found: Operators) 
 
 
 @played
-async def test_who_is_cut_off_stops_before_another_begins(found: Operators) -> None:
+async def test_an_isolated_operator_stops_before_another_begins(found: Operators) -> None:
     """The first one reaches no API server any more; the second one does."""
     way = KubernetesApi(found.store)
     async with way.serving():
@@ -258,7 +258,7 @@ async def test_a_lease_that_is_deleted_is_made_again(found: Operators) -> None:
     "spec",
     [None, {}, {"holderIdentity": None}, {"holderIdentity": "", "leaseTransitions": "many"}],
 )
-def test_a_lease_that_nobody_holds_is_taken(spec: Body | None) -> None:
+def test_a_lease_without_a_holder_is_taken(spec: Body | None) -> None:
     @played
     async def test(found: Operators) -> None:
         found.store.create("leases", NAMESPACE, {"metadata": {"name": NAME}, "spec": spec})
@@ -294,7 +294,7 @@ async def test_the_clocks_of_others_do_not_count(found: Operators) -> None:
 
 
 @played
-async def test_giving_up_what_cannot_be_reached_is_no_error(found: Operators) -> None:
+async def test_giving_up_an_unreachable_lease_is_no_error(found: Operators) -> None:
     elector = found.start("a")
     await until(lambda: elector.is_leader)
     elector.resign()
@@ -306,7 +306,7 @@ async def test_giving_up_what_cannot_be_reached_is_no_error(found: Operators) ->
 
 
 @played
-async def test_who_has_resigned_never_acts_again(found: Operators) -> None:
+async def test_a_resigned_operator_never_acts_again(found: Operators) -> None:
     elector = found.start("a")
     await until(lambda: elector.is_leader)
     elector.resign()

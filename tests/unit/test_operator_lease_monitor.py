@@ -288,7 +288,7 @@ async def test_an_outage_puts_the_loss_off_and_does_not_hide_it(watch: Watch) ->
 
 
 @played
-async def test_time_in_which_nobody_looked_does_not_count(watch: Watch) -> None:
+async def test_time_without_a_running_monitor_does_not_count(watch: Watch) -> None:
     """The operator's process was stopped, or its loop was busy."""
     watch.renew()
     watch.monitor.follow(ES, LEASE)
@@ -303,7 +303,7 @@ async def test_time_in_which_nobody_looked_does_not_count(watch: Watch) -> None:
 
 
 @played
-async def test_what_cannot_be_read_is_not_judged(watch: Watch) -> None:
+async def test_an_unreadable_lease_is_not_judged(watch: Watch) -> None:
     watch.api.faults.append(Fault("get", "leases", status=403, times=5))
     watch.monitor.follow(ES, LEASE)
     await asyncio.sleep(100)
@@ -334,7 +334,7 @@ async def test_nobody_is_watched_for_nothing(watch: Watch) -> None:
 
 
 @pytest.mark.parametrize("spec", ["text", 7, [], {"holderIdentity": 3, "renewTime": {}}])
-def test_nonsense_in_a_lease_is_no_sign_of_life(spec: object) -> None:
+def test_nonsense_in_a_lease_does_not_count_as_a_renewal(spec: object) -> None:
     @played
     async def test(watch: Watch) -> None:
         watch.store.create("leases", "team", {"metadata": {"name": "lease"}, "spec": spec})

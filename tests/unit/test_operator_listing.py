@@ -78,7 +78,7 @@ def test_half_an_answer_is_none(items: Any, length: int) -> None:
     ],
     ids=str,
 )
-def test_what_is_no_list_of_objects_is_refused(document: Any) -> None:
+def test_an_answer_that_is_no_list_of_objects_is_refused(document: Any) -> None:
     with pytest.raises(Unavailable):
         read(json.dumps(document).encode())
 
@@ -87,7 +87,7 @@ def test_what_is_no_list_of_objects_is_refused(document: Any) -> None:
     "data",
     [b"", b"<html>", b"\xff", b"{}{}", b'{"items":[{}{}]}', b"{1:2}x", b"[" * 100_000],
 )
-def test_what_is_no_document_is_refused(data: bytes) -> None:
+def test_an_answer_that_is_no_document_is_refused(data: bytes) -> None:
     with pytest.raises(Unavailable, match="list pods"):
         read(data)
 

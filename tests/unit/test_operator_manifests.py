@@ -30,7 +30,7 @@ def test_everything_belongs_to_the_pool() -> None:
         assert manifests.is_ours(pool, body)
 
 
-def test_an_object_of_an_earlier_pool_or_of_nobody_is_not_ours() -> None:
+def test_an_object_of_an_earlier_pool_or_without_owner_is_foreign() -> None:
     pool = make_pool()
     body = manifests.service(pool)
     body["metadata"]["ownerReferences"][0]["uid"] = "earlier"
@@ -39,7 +39,7 @@ def test_an_object_of_an_earlier_pool_or_of_nobody_is_not_ours() -> None:
     assert not manifests.is_ours(pool, {"metadata": {"ownerReferences": "junk"}})
 
 
-def test_the_service_selects_nothing() -> None:
+def test_the_service_has_no_selector() -> None:
     spec = manifests.service(make_pool())["spec"]
     assert "selector" not in spec
     assert (spec["type"], spec["ipFamilyPolicy"]) == ("ClusterIP", "PreferDualStack")
@@ -95,7 +95,7 @@ def test_a_slice_is_replaced_when_the_address_family_changes() -> None:
     assert not manifests.slice_must_be_replaced(make_pool(), manifests.endpoint_slice(pool))
 
 
-def test_the_secret_holds_what_it_is_given() -> None:
+def test_the_secret_holds_the_given_data() -> None:
     body = manifests.secret(make_pool(), {"ca.crt": "PEM"})
     assert body["metadata"]["name"] == "es-fiber-key"
     assert base64.b64decode(body["data"]["ca.crt"]) == b"PEM"

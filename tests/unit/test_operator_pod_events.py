@@ -62,7 +62,7 @@ def test_a_pod_without_events_has_no_warning() -> None:
     assert warning_of() == ""
 
 
-def test_the_newest_warning_is_told() -> None:
+def test_the_newest_warning_is_reported() -> None:
     sandbox = ("Warning", "FailedCreatePodSandBox")
     assert warning_of(event(MOUNT, 1), event(sandbox, 9)) == (
         "FailedCreatePodSandBox: failedcreatepodsandbox"
@@ -102,7 +102,7 @@ def test_a_repeated_event_is_as_new_as_its_last_time() -> None:
     assert warning_of(pulling, event(MOUNT, **series, **again)) != ""
 
 
-def test_events_of_other_pods_say_nothing() -> None:
+def test_events_of_other_pods_are_ignored() -> None:
     assert warning_of(event(MOUNT, involvedObject={"uid": "another"})) == ""
 
 

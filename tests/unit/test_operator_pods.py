@@ -49,7 +49,7 @@ def test_a_pod_that_was_ready_is_not_one_that_never_was() -> None:
     assert pod.message == "node silent"
 
 
-def test_a_deleted_pod_is_terminating_whatever_else() -> None:
+def test_a_deleted_pod_is_terminating_in_every_other_state() -> None:
     for document in (running(), ended(), waiting(1, "ErrImagePull"), pod_document()):
         pod = look(terminating(document))
         assert pod.state is PodState.TERMINATING
@@ -79,7 +79,7 @@ def test_another_container_can_keep_a_pod_from_starting(kind: str) -> None:
     assert look(document).message == "no x"
 
 
-def test_unschedulable_says_what_the_scheduler_says() -> None:
+def test_unschedulable_has_the_schedulers_reason() -> None:
     pod = look(unschedulable(1, "0/2 nodes are available: 2 Insufficient cpu."))
     assert pod.trouble is Trouble.UNSCHEDULABLE
     assert pod.message == "0/2 nodes are available: 2 Insufficient cpu."
@@ -125,7 +125,7 @@ def test_a_deadline_of_the_template_is_kept_without_blame() -> None:
         {"conditions": [condition("DisruptionTarget", "True", reason="DeletionByPodGC")]},
     ],
 )
-def test_what_the_cluster_ends_is_disrupted(status: dict[str, Any]) -> None:
+def test_pods_that_the_cluster_ends_are_disrupted(status: dict[str, Any]) -> None:
     document = ended(code=137)
     document["status"] |= status
     pod = look(document)

@@ -40,7 +40,7 @@ def environment(container: Json) -> dict[str, str]:
     return values
 
 
-def test_a_worker_knows_who_and_where_it_is() -> None:
+def test_a_worker_knows_its_identity_and_place() -> None:
     pool = make_pool(processesPerPod=8, master={**MASTER, "lostGraceSeconds": 90})
     worker = pod(pool, "es-0000000001", "10.96.1.2:7070")["spec"]["containers"][0]
     assert environment(worker) == {
@@ -255,7 +255,7 @@ def test_pods_meet_the_restricted_security_standard() -> None:
         }
 
 
-def test_what_the_template_says_of_security_wins() -> None:
+def test_the_templates_security_settings_win() -> None:
     pod_wide = {"runAsUser": 1000, "fsGroup": 5, "seccompProfile": {"type": "Unconfined"}}
     body = body_of({"securityContext": pod_wide})["spec"]
     assert body["securityContext"] == {**pod_wide, "runAsNonRoot": True}
@@ -317,7 +317,7 @@ def test_the_template_is_not_changed() -> None:
     assert pool.spec.template == before
 
 
-def test_null_is_the_same_as_nothing_said() -> None:
+def test_null_equals_an_absent_field() -> None:
     spec = {"securityContext": None, "volumes": None, "tolerations": None}
     container = {"name": "worker", "image": "i", "env": None, "securityContext": None}
     nulls, silent = body_of({**spec, "containers": [container]})["spec"], body_of()["spec"]
@@ -355,7 +355,7 @@ def test_the_hash_is_of_the_users_words() -> None:
     assert len(first) == 16
 
 
-def test_what_the_sdk_writes_starts_no_new_attempt() -> None:
+def test_fields_of_the_sdk_start_no_new_attempt() -> None:
     first = spec_hash(make_pool(replicas=1))
     release = {"release": ["es-0000000001"]}
     assert spec_hash(make_pool(replicas=2, scaleDown=release, maxReplicas=9)) == first
@@ -379,7 +379,7 @@ REQUESTS = {"cpu": "50m", "memory": "64Mi"}
         ({}, {"limits": {"cpu": "1", "memory": "1Gi"}}, {}),
     ],
 )
-def test_a_worker_requests_what_its_template_says_nothing_of(
+def test_a_worker_has_requests_that_its_template_does_not_set(
     resources: Json | None, of_the_pod: Json, requested: Json
 ) -> None:
     worker = {"name": "worker", "image": "i", "resources": resources}

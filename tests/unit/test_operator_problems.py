@@ -72,7 +72,7 @@ def test_what_waiting_does_not_mend_is_an_error_at_once(
     assert "spec.template" in found.message
 
 
-def test_an_image_that_would_run_as_root_is_told_how_to_go_on() -> None:
+def test_an_image_that_would_run_as_root_is_reported_with_the_remedy() -> None:
     kubelet = "container has runAsNonRoot and image will run as root"
     found = problem(POOL, waiting(1, "CreateContainerConfigError", kubelet))
     assert found.terminal
@@ -114,7 +114,7 @@ def test_unschedulable_is_a_warning_in_the_schedulers_words_until_it_takes_too_l
     assert (late.severity, late.terminal) == ("Error", False)
 
 
-def test_what_only_events_tell_is_told() -> None:
+def test_problems_that_only_events_show_are_reported() -> None:
     mount = 'FailedMount: MountVolume.SetUp failed for volume "data": secret "token" not found'
     pod = waiting(1, "ContainerCreating", age=8)
     found = problem(POOL, pod, warnings={name_of(1): mount})
@@ -128,7 +128,7 @@ def test_a_pod_that_takes_too_long_is_an_error() -> None:
     assert "900 s" in found.message
 
 
-def test_a_worker_that_ran_and_was_never_ready_is_told_with_all_that_is_known_of_it() -> None:
+def test_a_worker_that_ran_and_was_never_ready_is_reported_with_all_details() -> None:
     pod = running(1, age=902, ready=False)
     pod["status"]["conditions"][0]["message"] = "containers with unready status: [worker]"
     found = problem(POOL, pod)
@@ -142,7 +142,7 @@ def test_a_worker_that_ran_and_was_never_ready_is_told_with_all_that_is_known_of
     assert probe in problem(POOL, pod, warnings={name_of(1): probe}).message
 
 
-def test_a_worker_that_is_not_ready_any_more_is_a_warning() -> None:
+def test_a_worker_that_lost_its_readiness_is_a_warning() -> None:
     pod = running(1)
     pod["status"]["conditions"] = [condition("Ready", "False", ago=5, message="node silent")]
     found = problem(POOL, pod)
@@ -217,7 +217,7 @@ def test_workers_that_end_well_again_and_again_are_a_warning_that_says_what_it_m
     assert status_of(pool, running(3, age=-900), now=now + 970).problems == ()
 
 
-def test_of_a_failure_and_an_end_in_one_wave_the_failure_is_told() -> None:
+def test_of_a_failure_and_an_end_in_one_wave_the_failure_is_reported() -> None:
     pods = ended(1, ago=5), ended(2, code=0, ran=100)
     first = status_of(POOL, *pods)
     (found,) = first.problems
@@ -307,7 +307,7 @@ def test_a_problem_is_not_there_since_a_time_that_has_not_come() -> None:
     assert third.problems[0].severity == "Error", "it was a warning for half a minute"
 
 
-def test_past_the_limit_the_first_problem_says_what_to_do() -> None:
+def test_past_the_limit_the_first_problem_names_the_remedy() -> None:
     pool = make_pool(replicas=1, failurePolicy={"backoffLimit": 0})
     status = status_of(pool, ended(1, code=7))
     limit, cause = status.problems
@@ -331,7 +331,7 @@ def test_past_the_limit_the_first_problem_says_what_to_do() -> None:
         (422, "spec.containers[0].image: Required value", "InvalidTemplate", True),
     ],
 )
-def test_a_refusal_is_told_in_the_api_servers_words(
+def test_a_refusal_is_reported_in_the_api_servers_words(
     code: int, said: str, reason: str, terminal: bool
 ) -> None:
     refused = PodRefusal(template_hash(POOL), code, said, NOW)
@@ -365,14 +365,14 @@ def test_a_namespace_that_is_deleted_is_no_problem_of_its_pools() -> None:
     assert status_of(POOL, refusal=refused).problems == ()
 
 
-def test_an_obstacle_is_told_as_it_is() -> None:
+def test_an_obstacle_is_reported_unchanged() -> None:
     obstacle = Obstacle(Reason.NAME_TAKEN, "the Service es-fiber is another's", True)
     found = problem(POOL, running(1), obstacles=(obstacle,))
     assert (found.reason, found.message) == ("NameTaken", obstacle.message)
     assert found.terminal
 
 
-def test_a_lost_master_is_told_with_what_will_follow() -> None:
+def test_a_lost_master_is_reported_with_the_consequence() -> None:
     pool = make_pool(replicas=1, master={**MASTER, "leaseName": "es"}, onLost="Delete")
     expired = plans.LeaseVerdict(alive=False)
     found = problem(pool, running(1), master=expired)
@@ -381,7 +381,7 @@ def test_a_lost_master_is_told_with_what_will_follow() -> None:
         assert said in found.message
 
 
-def test_a_lease_that_is_gone_is_told_so() -> None:
+def test_a_lost_lease_is_reported() -> None:
     pool = make_pool(replicas=1, master={**MASTER, "leaseName": "es"})
     seen = then(pool, status_of(pool, running(1), master=plans.LeaseVerdict(alive=True)))
     found = problem(seen, running(1), master=plans.LeaseVerdict(alive=False, missing=True))
@@ -389,7 +389,7 @@ def test_a_lease_that_is_gone_is_told_so() -> None:
     assert "The Lease es did not exist for 30 s" in found.message
 
 
-def test_a_lease_that_is_not_there_is_told_with_what_to_do() -> None:
+def test_a_missing_lease_is_reported_with_the_remedy() -> None:
     pool = make_pool(replicas=1, master={**MASTER, "leaseName": "se"})
     first = status_of(pool, running(1), master=plans.LeaseVerdict(missing=True))
     (found,) = first.problems
@@ -403,7 +403,7 @@ def test_a_lease_that_is_not_there_is_told_with_what_to_do() -> None:
     assert (later.reason, later.severity) == ("LeaseNotFound", "Error")
 
 
-def test_a_master_of_the_other_address_family_is_told() -> None:
+def test_a_master_of_the_other_address_family_is_reported() -> None:
     pool = make_pool(replicas=1, master={**MASTER, "host": "fd00::7"})
     found = problem(pool, running(1))
     assert (found.reason, found.terminal) == ("InvalidSpec", True)
@@ -418,7 +418,7 @@ def test_a_master_of_either_family_of_the_service_is_right() -> None:
         assert status_of(pool, running(1), address=addresses).problems == ()
 
 
-def test_names_that_are_no_workers_are_told() -> None:
+def test_names_that_are_no_workers_are_reported() -> None:
     release = {"release": [name_of(1), "es-web", "other-0000000001"]}
     found = problem(make_pool(replicas=1, scaleDown=release), running(2))
     assert (found.reason, found.severity, found.count) == ("InvalidRelease", "Warning", 2)

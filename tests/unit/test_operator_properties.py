@@ -262,7 +262,7 @@ def nothing_is_planned_twice(
 @pytest.mark.slow
 @settings(max_examples=250, deadline=None)
 @given(cases())
-def test_what_holds_of_every_plan(case: Case) -> None:
+def test_every_plan_has_all_properties(case: Case) -> None:
     """Check all properties of one plan: to draw a case takes longer than to check it."""
     made = plan(*case, NOW)
     only_pods_of_the_pool_are_deleted_and_each_once(made, *case)
@@ -371,7 +371,7 @@ LIVES = st.lists(
 
 @settings(max_examples=100, deadline=None, phases=NO_SHRINKING)
 @given(LIVES, st.sampled_from(["OnIdle", "Recreate"]))
-def test_only_what_the_cluster_ends_is_disrupted(
+def test_only_pods_that_the_cluster_ends_are_disrupted(
     life: list[tuple[str, int, int]], strategy: str
 ) -> None:
     model, evicted = Model(pool_document(replicas=4, update={"strategy": strategy})), 0
@@ -478,7 +478,7 @@ def test_junk_in_the_status_is_written_over(junk: Any, fields: dict[str, Any]) -
     field=st.sampled_from(["replicas", "template", "master", "update", "generation", "problems"]),
     junk=ANYTHING,
 )
-def test_junk_in_the_spec_deletes_nothing(key: str, field: str, junk: Any) -> None:
+def test_junk_in_the_spec_deletes_no_pod(key: str, field: str, junk: Any) -> None:
     document = pool_document(replicas=2)
     document[key][field] = junk
     pods = [view(number, PodState.READY) for number in range(4)]

@@ -129,7 +129,7 @@ def test_a_pod_that_is_not_linked_counts_as_one_that_runs() -> None:
     ],
     ids=["own-readiness", "own-startup", "no-probe"],
 )
-def test_what_else_keeps_a_pod_from_ready_does(document: Json) -> None:
+def test_other_reasons_keep_a_pod_from_ready(document: Json) -> None:
     found = observe(document, "worker")
     assert (found.state, found.joining) == (PodState.STARTING, False)
 
@@ -157,7 +157,7 @@ def test_a_pool_is_ready_when_its_workers_are_linked() -> None:
     assert status.proven_template_hash == status.template_hash  # the canaries do not wait for it
 
 
-def test_a_worker_that_reaches_nobody_is_neither_replaced_nor_a_failure() -> None:
+def test_a_worker_without_a_master_is_neither_replaced_nor_a_failure() -> None:
     pool = make_pool(replicas=1, master=MASTER)
     late = NOW + 10 * pool.spec.failure_policy.startup_timeout_seconds
     made = plan_of(pool, joining(), now=late)
@@ -173,7 +173,7 @@ def test_without_a_master_everyone_waits_on_purpose() -> None:
     assert (lost.ready_replicas, lost.connected_replicas) == (2, 0)
 
 
-def test_the_metrics_tell_them_from_those_that_are_ready() -> None:
+def test_the_metrics_distinguish_connected_from_ready_pods() -> None:
     found = PoolSample.of({}, [observe(each, "worker") for each in (running(1), joining(2))])
     assert found.pods == {"ready": 1, "starting": 1}
 

@@ -106,7 +106,7 @@ def test_a_template_is_tried_in_a_dry_run_first() -> None:
     assert plan_of(worked, accepted=None).create == 3
 
 
-def test_nothing_is_created_without_an_address_or_with_an_obstacle() -> None:
+def test_no_pod_is_created_without_an_address_or_with_an_obstacle() -> None:
     pool = tried(replicas=3)
     obstacle = plans.Obstacle(Reason.NAME_TAKEN, "taken")
     assert plan_of(pool, address=None).create == 0
@@ -128,7 +128,7 @@ def test_a_refusal_is_tried_again_after_a_while() -> None:
 # -- Down
 
 
-def test_released_pods_go_whatever_replicas_says() -> None:
+def test_released_pods_go_for_any_replicas() -> None:
     pool = tried(replicas=3, master=MASTER, scaleDown={"release": [*names(1, 9), "another"]})
     made = plan_of(pool, running(1), running(2), running(3))
     assert gone(made) == names(1)
@@ -230,7 +230,7 @@ def test_on_idle_leaves_ready_workers_to_their_master() -> None:
     assert plan_of(released, *outdated(running(1)), running(3)).create == 1
 
 
-def test_a_worker_whose_template_nobody_can_tell_is_not_outdated() -> None:
+def test_a_worker_of_an_unknown_template_is_not_outdated() -> None:
     pool = tried(replicas=1)
     (worker,) = views(pool, running(1))
     made = plan(pool, [replace(worker, template_hash="")], knowledge_of(pool), NOW)
@@ -255,14 +255,14 @@ def test_recreate_replaces_all_at_once() -> None:
     assert (gone(made), made.create) == (names(1, 2), 2)
 
 
-def test_on_delete_replaces_what_somebody_deletes() -> None:
+def test_on_delete_replaces_deleted_pods() -> None:
     pool = tried(replicas=2, update={"strategy": "OnDelete"})
     made = plan_of(pool, *outdated(running(1), terminating(running(2))))
     assert (gone(made), made.create) == ([], 1)
 
 
 @pytest.mark.parametrize("strategy", ["OnIdle", "Recreate"])
-def test_a_template_that_is_refused_replaces_nothing(strategy: str) -> None:
+def test_a_refused_template_replaces_no_pod(strategy: str) -> None:
     pool = make_pool(replicas=2, update={"strategy": strategy})
     old = outdated(running(1), pod_document(2))
     assert plan_of(pool, *old, accepted=None).delete == ()

@@ -26,7 +26,7 @@ TEMPLATE = {
 }
 
 
-def test_the_hash_of_a_template_is_what_it_always_was() -> None:
+def test_the_hash_of_a_template_is_stable() -> None:
     """Pods carry it as a label, and one that differs is that of an older template.
 
     If this fails, the change that made it fail restarts every worker of every pool when its
@@ -45,7 +45,7 @@ def test_the_hash_of_a_template_is_what_it_always_was() -> None:
         {"failurePolicy": {"backoffLimit": 1}, "update": {"strategy": "OnDelete"}},
     ],
 )
-def test_nothing_but_the_template_makes_pods_outdated(spec: dict[str, Any]) -> None:
+def test_only_the_template_makes_pods_outdated(spec: dict[str, Any]) -> None:
     assert template_hash(make_pool(**spec)) == template_hash(make_pool())
 
 

@@ -78,7 +78,7 @@ async def test_one_that_waits_for_the_lease_is_alive_and_not_ready(world: World)
 
 
 @played
-async def test_pools_that_cannot_be_listed_are_told(world: World) -> None:
+async def test_pools_that_cannot_be_listed_are_reported(world: World) -> None:
     await world.settled()
     message = 'fiberpools.fiber.dev is forbidden: User "operator" cannot list'
     refused = Fault("list", "fiberpools", status=403, message=message, times=10**6)
@@ -171,7 +171,7 @@ def test_pools_that_wait_or_are_not_watched_are_not_served() -> None:
 
 
 @played
-async def test_metrics_tell_of_calls_turns_and_pools(world: World) -> None:
+async def test_metrics_count_calls_reconciles_and_pools(world: World) -> None:
     world.make_pool(replicas=5)
     await world.ready(5)
     world.kubelet.exit(NAMESPACE, world.names()[0], 3)

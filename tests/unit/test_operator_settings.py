@@ -22,7 +22,7 @@ def read(**environment: str) -> OperatorSettings:
     )
 
 
-def test_nothing_needs_to_be_set() -> None:
+def test_no_setting_is_required() -> None:
     settings = read()
     assert settings.namespaces == ()
     assert (settings.host, settings.port) == ("", 8080)
@@ -82,12 +82,12 @@ def test_everything_can_be_set() -> None:
         ("LOG_FORMAT", "xml"),
     ],
 )
-def test_what_makes_no_sense_is_named(name: str, value: str) -> None:
+def test_an_invalid_setting_is_named(name: str, value: str) -> None:
     with pytest.raises(SettingsError, match=f"FIBER_OPERATOR_{name}="):
         read(**{name: value})
 
 
-def test_all_that_is_wrong_is_told_at_once() -> None:
+def test_all_invalid_settings_are_reported_at_once() -> None:
     with pytest.raises(SettingsError) as caught:
         read(LOG_LEVEL="LOUD", NAMESPACE="-", NAMESPCES="one")
     message = str(caught.value)
@@ -173,7 +173,7 @@ def test_kopfs_own_lines_say_which_object_they_are_about(lines: io.StringIO) -> 
     assert (found["kind"], found["name"], found["namespace"]) == ("Pod", "p", "team")
 
 
-def test_kopf_does_not_tell_of_every_event(lines: io.StringIO) -> None:
+def test_kopf_does_not_log_every_event(lines: io.StringIO) -> None:
     logs.set_up("INFO", "json", lines)
     logging.getLogger("kopf.objects").info("Handler succeeded.")
     assert lines.getvalue() == ""

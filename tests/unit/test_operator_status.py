@@ -139,7 +139,7 @@ def test_readiness_progress_and_phase(
         ({"minReplicas": 2}, ("False", "WithinBounds")),
     ],
 )
-def test_bounds_that_bind_are_told(spec: Json, expected: tuple[str, str]) -> None:
+def test_binding_bounds_are_reported(spec: Json, expected: tuple[str, str]) -> None:
     assert told(status_of(make_pool(**spec)))["ScalingLimited"] == expected
 
 
@@ -169,7 +169,7 @@ def test_a_condition_keeps_its_time_until_its_status_changes() -> None:
     assert times["Ready"] == NOW + 9
 
 
-def test_time_alone_changes_nothing() -> None:
+def test_time_alone_changes_no_field() -> None:
     pool = make_pool(replicas=3)
     pods = [running(1), running(2), ended(3)]
     pool = with_plan(pool, plan_of(pool, *pods))
@@ -207,7 +207,7 @@ def test_what_is_no_more_is_none_in_the_patch() -> None:
     assert made.status["problems"] == []
 
 
-def test_a_spec_that_cannot_be_read_is_told_and_counts_go_on() -> None:
+def test_an_unreadable_spec_is_reported_and_counts_go_on() -> None:
     pool = make_pool(replicas=1, master=MASTER)
     document = pool_document(
         with_plan(pool, plan_of(pool, running(1))).status.model_dump(mode="json", by_alias=True)

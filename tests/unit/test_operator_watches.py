@@ -71,7 +71,7 @@ def test_a_missing_right_is_named_until_it_is_there(caplog: pytest.LogCaptureFix
     assert caplog.messages == [said, "watch pods works again"]
 
 
-def test_what_else_fails_is_told_too() -> None:
+def test_other_failures_are_reported_too() -> None:
     watches = all_well()
     watches.answered("list pods", Unavailable("too busy", what="list pods", status=500))
     assert watches.wrong() == ["changes are not seen: list pods: too busy"]

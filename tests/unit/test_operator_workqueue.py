@@ -74,7 +74,7 @@ def played(concurrency: int = 8) -> Callable[[Test], Callable[[], None]]:
 
 
 @played()
-async def test_what_is_added_is_reconciled_at_once(
+async def test_an_added_pool_is_reconciled_at_once(
     queue: WorkQueue, reconciler: Reconciler
 ) -> None:
     queue.add(A)
@@ -135,7 +135,9 @@ async def test_urgent_ones_during_a_turn_follow_at_once(
 
 
 @played()
-async def test_a_pool_rests_whatever_happens(queue: WorkQueue, reconciler: Reconciler) -> None:
+async def test_a_pool_always_rests_between_reconciles(
+    queue: WorkQueue, reconciler: Reconciler
+) -> None:
     reconciler.result = Result(rest=4.0)
     queue.add(A)
     await asyncio.sleep(1)
@@ -304,9 +306,7 @@ def test_pools_in_trouble_do_not_hold_up_the_others(pools: int, since: float) ->
 
 
 @played(concurrency=1)
-async def test_who_fails_is_not_forgotten_over_others(
-    queue: WorkQueue, reconciler: Reconciler
-) -> None:
+async def test_a_failing_pool_is_not_forgotten(queue: WorkQueue, reconciler: Reconciler) -> None:
     reconciler.result = Result(failed=True)
     queue.add(A)
     await asyncio.sleep(0.1)
@@ -357,7 +357,7 @@ async def test_a_pool_made_again_meanwhile_is_not_forgotten(
 
 
 @played()
-async def test_statistics_tell_what_waits_and_runs(
+async def test_statistics_count_waiting_and_running_pools(
     queue: WorkQueue, reconciler: Reconciler
 ) -> None:
     reconciler.lasts = 100.0
@@ -395,7 +395,7 @@ async def test_draining_does_not_wait_for_ever(queue: WorkQueue, reconciler: Rec
 
 
 @played()
-async def test_an_end_in_the_middle_of_a_turn_leaves_nothing(
+async def test_an_end_in_the_middle_of_a_turn_leaves_no_task(
     queue: WorkQueue, reconciler: Reconciler
 ) -> None:
     reconciler.lasts = 1000.0

@@ -117,7 +117,7 @@ def test_descriptors_belong_to_the_outbox_whatever_happens(
         os.close(reader)
 
 
-def test_recall_returns_what_never_left_in_order(ends: tuple[Outbox, socket.socket]) -> None:
+def test_recall_returns_unsent_packets_in_order(ends: tuple[Outbox, socket.socket]) -> None:
     box, theirs = ends
     sent = [bytes([index]) + FULL for index in range(20)]
     for payload in sent:

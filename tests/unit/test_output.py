@@ -114,7 +114,7 @@ def test_a_line_stands_below_what_is_written(stderr: Stuck, lines: OutputWriter)
     assert stderr.getvalue() == f"1 of 2{erase}[w] line 1\n1 of 2{erase}2 of 2{erase}"
 
 
-def test_a_line_that_stands_goes_at_the_end(stderr: Stuck, lines: OutputWriter) -> None:
+def test_a_standing_line_is_removed_at_the_end(stderr: Stuck, lines: OutputWriter) -> None:
     stderr.goes_on.set()
     lines.show("1 of 2")
     lines.close()

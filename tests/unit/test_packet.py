@@ -132,7 +132,7 @@ def test_objects_arrive_with_their_arrays_writable(pair: Pair) -> None:
         assert copy.flags.writeable
 
 
-def test_a_message_is_released_whatever_unpickling_does(pair: Pair) -> None:
+def test_a_message_is_released_after_any_unpickling(pair: Pair) -> None:
     one, other = pair
     packet.send(one, b"no pickle")
     message = packet.receive(other)
@@ -208,7 +208,7 @@ def test_without_waiting_there_may_be_nothing(pair: Pair) -> None:
 
 
 @pytest.mark.parametrize("size", [10, 200_000])
-def test_a_full_socket_takes_nothing(pair: Pair, size: int) -> None:
+def test_a_full_socket_takes_no_packet(pair: Pair, size: int) -> None:
     one, other = pair
     one.setblocking(False)
     sent = 0
@@ -269,7 +269,7 @@ def test_what_the_peer_left_unread_does_not_hide_what_it_sent(pair: Pair) -> Non
         packet.receive(other)
 
 
-def test_sending_to_who_left_something_unread_is_a_broken_pipe(pair: Pair) -> None:
+def test_sending_to_a_peer_that_left_messages_unread_is_a_broken_pipe(pair: Pair) -> None:
     one, other = pair
     packet.send(other, b"never read")
     one.close()

@@ -87,7 +87,7 @@ def test_packed_children_leave_agents_idle_and_those_that_are_idle_longest_stay_
     assert placement.room == 3
 
 
-def test_a_silent_agent_gets_none_until_it_is_heard_again() -> None:
+def test_a_silent_agent_gets_no_child_until_it_answers() -> None:
     placement = with_agents("a", slots=2)
     placement.withhold("a", "silent")
     assert put(placement, "1") == []
@@ -238,7 +238,7 @@ def test_one_that_retires_ends_its_work_and_goes_at_once() -> None:
 
 
 @pytest.mark.slow
-def test_what_a_child_costs_does_not_grow_with_those_before() -> None:
+def test_the_cost_of_a_child_does_not_grow_with_their_number() -> None:
     many = 150_000
     placement = with_agents(*map(str, range(many)), slots=1)
     for child in range(many):

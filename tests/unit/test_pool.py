@@ -278,7 +278,7 @@ def test_error_callbacks_get_the_error(pool: Pool) -> None:
     assert [type(error) for error in seen] == [ValueError]
 
 
-def test_a_callback_that_raises_is_reported_and_harms_nothing(
+def test_a_callback_that_raises_is_reported_and_harms_no_result(
     pool: Pool, capsys: pytest.CaptureFixture[str]
 ) -> None:
     result = pool.apply_async(tasks.square, (3,), callback=tasks.raise_value_error)
@@ -340,7 +340,7 @@ def test_input_is_read_little_faster_than_it_is_worked_off(pool: Pool, tmp_path:
 
 
 @pytest.mark.parametrize("unordered", [True, False])
-def test_buffersize_bounds_what_is_read_and_not_consumed(pool: Pool, unordered: bool) -> None:
+def test_buffersize_bounds_unconsumed_input(pool: Pool, unordered: bool) -> None:
     read = 0
 
     def source() -> Iterator[int]:
@@ -361,7 +361,7 @@ def test_buffersize_bounds_what_is_read_and_not_consumed(pool: Pool, unordered: 
     ), "the infinite input is still read"
 
 
-def test_a_slow_input_holds_nothing_up(pool: Pool) -> None:
+def test_a_slow_input_delays_no_other_call(pool: Pool) -> None:
     given = threading.Semaphore(0)
 
     def source() -> Iterator[int]:

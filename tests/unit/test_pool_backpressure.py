@@ -45,7 +45,7 @@ def _unread(iterator: Any) -> int:
 
 @pytest.mark.parametrize("method", ["imap", "imap_unordered"])
 @pytest.mark.parametrize("source", [list, iter], ids=["a list", "an iterator"])
-def test_an_iterator_that_nobody_reads_holds_back_its_tasks(
+def test_an_unread_iterator_holds_back_its_tasks(
     pool: Pool, method: str, source: Callable[[Any], Any]
 ) -> None:
     imap: Imap = getattr(pool, method)
@@ -58,7 +58,7 @@ def test_an_iterator_that_nobody_reads_holds_back_its_tasks(
 
 @pytest.mark.parametrize("chunksize", [1, 7])
 @pytest.mark.parametrize("function", [bytes, partial(row_of, bytes), " ".__mul__])
-def test_plain_results_count_as_well(
+def test_plain_results_count_too(
     pool: Pool, function: Callable[[int], Any], chunksize: int
 ) -> None:
     iterator = pool.imap(function, [RESULT] * MANY, chunksize)

@@ -92,7 +92,7 @@ def test_a_program_that_a_tasks_sys_exit_ends_says_which_task(backend: str, call
 
 @pytest.mark.parametrize("chunksize", [None, 1, 2])
 @pytest.mark.parametrize("kind", [KeyboardInterrupt, GeneratorExit])
-def test_what_is_no_exception_is_still_the_tasks_error(
+def test_a_base_exception_is_still_the_tasks_error(
     pool: Pool, kind: type[BaseException], chunksize: int | None
 ) -> None:
     before = {process.pid for process in pool._pool}
@@ -115,7 +115,7 @@ def test_sigint_ends_the_task_that_runs_and_not_its_worker(pool: Pool, tmp_path:
     assert worker in {process.pid for process in pool._pool}
 
 
-def test_sigint_does_nothing_to_an_idle_worker(pool: Pool) -> None:
+def test_sigint_does_not_end_an_idle_worker(pool: Pool) -> None:
     workers = {pool.apply(tasks.pid)}
     for process in pool._pool:
         os.kill(process.pid, signal.SIGINT)
@@ -133,7 +133,7 @@ def test_a_task_runs_again_when_its_worker_died(pool: Pool, tmp_path: Path) -> N
     assert pool.map(tasks.die_at_first, [tmp_path / "b"], 1) == ["lived"]
 
 
-def test_a_worker_killed_from_outside_costs_nothing(pool: Pool, tmp_path: Path) -> None:
+def test_a_worker_killed_from_outside_loses_no_task(pool: Pool, tmp_path: Path) -> None:
     path, gate = tmp_path / "here", tmp_path / "gate"
     result = pool.apply_async(tasks.announce_and_wait, (path, gate))
     (victim,) = tasks.wait_until_announced(path)
@@ -328,7 +328,7 @@ def test_a_wave_of_kills_is_outlived(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.slow
-def test_who_waits_long_for_workers_is_told_why(
+def test_a_long_wait_for_workers_reports_the_reason(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(start_failures, "RAISED_PATIENCE", PATIENCE)

@@ -50,7 +50,7 @@ def test_errors_stay_with_their_tasks(pool: Pool, chunksize: int | None) -> None
         pool.map(tasks.raise_if_odd, range(40), chunksize)
 
 
-def test_what_is_not_an_exception_reaches_the_caller(pool: Pool) -> None:
+def test_a_base_exception_reaches_the_caller(pool: Pool) -> None:
     with pytest.raises(tasks.Exotic, match="strange"):
         pool.apply(tasks.raise_exotic)
 

@@ -62,7 +62,7 @@ def test_join_does_not_wait_for_results_to_be_consumed() -> None:
     assert list(iterator) == [x * x for x in range(50)]
 
 
-def test_a_closed_pool_takes_nothing_more() -> None:
+def test_a_closed_pool_accepts_no_call() -> None:
     pool = fiber.Pool(1)
     pool.close()
     pool.close()

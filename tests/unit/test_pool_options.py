@@ -83,7 +83,7 @@ CALLS: dict[str, Callable[[Any, Any], Any]] = {
 
 
 @pytest.mark.parametrize("call", CALLS)
-def test_what_cannot_be_called_is_an_error_and_no_hang(pool: Pool, call: str) -> None:
+def test_a_function_that_cannot_be_called_is_an_error_and_no_hang(pool: Pool, call: str) -> None:
     with pytest.raises(TypeError, match="'NoneType' object is not callable"):
         CALLS[call](pool, None)
 

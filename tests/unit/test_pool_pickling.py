@@ -44,7 +44,7 @@ WAITS: dict[str, Callable[[Pool], Any]] = {
 
 
 @pytest.mark.parametrize("ask", WAITS.values(), ids=WAITS.keys())
-def test_who_waits_for_the_same_pool_is_refused(ask: Callable[[Pool], Any]) -> None:
+def test_a_wait_for_the_same_pool_is_refused(ask: Callable[[Pool], Any]) -> None:
     with fiber.Pool(1) as pool:
         found = pool.map_async(abs, [Asking(lambda: ask(pool))])
         with pytest.raises(RuntimeError, match="cannot wait for a result of the same pool"):

@@ -84,7 +84,7 @@ def test_threads_that_no_fork_finds_do_no_harm(
     [(PYTHON_THREAD, "waits for ever"), (NATIVE_THREAD, "a helper")],
     ids=["python", "native"],
 )
-def test_threads_that_outlive_a_fork_are_told_once(
+def test_threads_that_survive_a_fork_are_reported_once(
     progress_table: ProgressTable,
     tmp_path: Path,
     capfd: pytest.CaptureFixture[str],

@@ -119,7 +119,7 @@ def test_what_does_not_pickle_is_refused_at_the_start_and_leaks_nothing(
         ({"target": print, "kwargs": {"file": threading.Lock()}}, "argument 'file'"),
     ],
 )
-def test_what_does_not_pickle_is_named(options: dict[str, Any], culprit: str) -> None:
+def test_an_argument_that_does_not_pickle_is_named(options: dict[str, Any], culprit: str) -> None:
     with pytest.raises(UnpicklableError, match=f"{culprit} of process 'odd' cannot be pickled"):
         fiber.Process(name="odd", **options).start()
 

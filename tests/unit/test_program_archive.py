@@ -24,7 +24,7 @@ def folder(tmp_path: Path) -> Path:
     return write(tmp_path / "es", main_py="import es", data__weights_npy=b"\0\1")
 
 
-def test_what_is_packed_is_there_again(folder: Path, tmp_path: Path) -> None:
+def test_packed_files_are_unpacked_unchanged(folder: Path, tmp_path: Path) -> None:
     (folder / "out").mkdir()
     (folder / "run").write_text("#!/bin/sh")
     (folder / "run").chmod(0o755)
@@ -129,7 +129,7 @@ def test_only_files_folders_and_links_are_sent(folder: Path, tmp_path: Path) -> 
     assert sorted(os.listdir(there / "es")) == ["data", "main.py"]
 
 
-def test_what_cannot_be_read_is_left_out(
+def test_unreadable_files_are_left_out(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refusing(path: str, *args: int) -> int:
@@ -383,7 +383,7 @@ def archive_of(**members: dict[str, object]) -> bytes:
         {"link": {"type": tarfile.SYMTYPE, "linkname": "a/../../etc"}},
     ],
 )
-def test_what_leads_out_of_the_folder_is_refused(
+def test_paths_that_lead_out_of_the_folder_are_refused(
     members: dict[str, dict[str, object]], tmp_path: Path
 ) -> None:
     with pytest.raises(ValueError, match="leads out of the folder"):
@@ -403,7 +403,7 @@ def test_no_file_is_written_through_a_link(tmp_path: Path) -> None:
         unpacked(archive_of(**members), tmp_path / "there")
 
 
-def test_an_archive_that_is_cut_short_leaves_nothing(folder: Path, tmp_path: Path) -> None:
+def test_a_truncated_archive_leaves_no_file(folder: Path, tmp_path: Path) -> None:
     write(folder, random_bin=os.urandom(1 << 16))
     with pytest.raises((tarfile.ReadError, EOFError)):
         unpacked(packed(folder)[:-1000], tmp_path / "there")

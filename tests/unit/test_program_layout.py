@@ -199,7 +199,7 @@ def test_what_was_left_out_is_sent_as_far_as_it_was_imported(machine: Machine) -
     assert layout.places == {str(machine.es / "pkg/sub/tool.py"): "program/tool.py"}
 
 
-def test_what_was_imported_is_named(machine: Machine) -> None:
+def test_imported_modules_are_named(machine: Machine) -> None:
     machine.runs(machine.es / "main.py")
     machine.has_imported("tool", machine.es / "pkg/sub/tool.py")
     machine.has_imported("gone", machine.es / "gone.py")

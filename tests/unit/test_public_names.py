@@ -31,7 +31,7 @@ SUBMODULES = [
 ]
 
 
-def test_dir_shows_what_there_is_and_nothing_else() -> None:
+def test_dir_shows_exactly_the_existing_names() -> None:
     assert dir(fiber) == sorted({*fiber.__all__, *fiber._SUBMODULES, "__version__"})
     assert {*multiprocessing.__all__, "SUBDEBUG", "SUBWARNING"} <= set(dir(fiber))
     for name in dir(fiber):

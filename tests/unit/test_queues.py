@@ -369,7 +369,7 @@ def announce_and_get(queue: Any, ready: Any) -> None:
     queue.get()
 
 
-def test_a_reader_killed_while_it_waits_takes_nothing() -> None:
+def test_a_reader_killed_while_it_waits_takes_no_item() -> None:
     queue, ready = fiber.Queue(1), fiber.Event()
     for _ in range(3):
         process = start(announce_and_get, queue, ready)

@@ -36,19 +36,19 @@ def open_files() -> int:
     return len(os.listdir("/proc/self/fd"))
 
 
-def test_what_can_be_imported_goes_by_reference() -> None:
+def test_importable_objects_are_pickled_by_reference() -> None:
     data = reduction.dumps(Point.origin)
     assert b"cloudpickle" not in data
     assert pickle.loads(data)().x == 0
 
 
 @pytest.mark.parametrize("make", [lambda: lambda: 42, lambda: type("Local", (), {"f": 42})])
-def test_what_cannot_goes_by_value(make: Any) -> None:
+def test_other_objects_are_pickled_by_value(make: Any) -> None:
     thing = pickle.loads(reduction.dumps(make()))
     assert (thing() if type(thing) is not type else thing.f) == 42
 
 
-def test_what_plain_pickle_can_do_needs_no_cloudpickle(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_plain_pickles_need_no_cloudpickle(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse() -> None:
         raise AssertionError("cloudpickle was asked")
 

@@ -9,7 +9,7 @@ from fiber._transport.acceptor import Refusals
 
 
 @pytest.mark.parametrize("own", [False, True])
-def test_the_same_is_told_once_and_again_after_some_minutes(own: bool) -> None:
+def test_a_repeated_refusal_is_reported_once_and_again_after_some_minutes(own: bool) -> None:
     told = Refusals()
     assert "late" in told.news("here", "here:1", "late", 0.0, own=own)
     assert not told.news("here", "here:2", "late", acceptor._FORGET - 1, own=own)
@@ -38,7 +38,7 @@ def test_strangers_from_many_addresses_are_summed_up() -> None:
     assert "x:1 (new)" in summary
 
 
-def test_own_agents_are_told_of_whatever_strangers_do() -> None:
+def test_refusals_of_own_agents_are_reported_in_spite_of_strangers() -> None:
     told = Refusals()
     many_strangers(told, 0.0, 1000)
     news = told.news("node", "node:1", "'agent-1' has another version", 1.0, own=True)

@@ -79,7 +79,7 @@ def _ends(far: Far) -> None:
 
 
 @pytest.mark.parametrize("event", [_says, _ends])
-def test_who_waits_is_woken(far: Far, event: Callable[[Far], None]) -> None:
+def test_a_waiting_caller_is_woken(far: Far, event: Callable[[Far], None]) -> None:
     channel = far.child.lend()
     assert channel is not None
     heard: list[Any] = []

@@ -71,7 +71,7 @@ def test_one_host_at_a_time(here: Any, far: Far) -> None:
     assert there.acquire(False)
 
 
-def test_who_waits_elsewhere_gets_it(here: Any, far: Far) -> None:
+def test_a_waiter_elsewhere_gets_the_lock(here: Any, far: Far) -> None:
     there = far(here)
     got: list[Any] = []
     with here:
@@ -156,7 +156,7 @@ def acquired_after_death(there: Any, here: Any) -> Any:
 
 
 @pytest.mark.filterwarnings("ignore:MainProcess:RuntimeWarning")
-def test_who_dies_elsewhere_gives_it_back(here: Any, far: Far) -> None:
+def test_a_dead_holder_elsewhere_gives_it_back(here: Any, far: Far) -> None:
     there = far(here)
     assert there.acquire()
     die_holding(there)
@@ -168,7 +168,7 @@ def test_who_dies_elsewhere_gives_it_back(here: Any, far: Far) -> None:
     assert here.acquire() is True
 
 
-def test_the_warning_names_who_died_elsewhere(far: Far, hosts: Hosts) -> None:
+def test_the_warning_names_the_process_that_died_elsewhere(far: Far, hosts: Hosts) -> None:
     here = fiber.Lock()
     there = far(here)
     assert there.acquire()
@@ -177,7 +177,7 @@ def test_the_warning_names_who_died_elsewhere(far: Far, hosts: Hosts) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:MainProcess:RuntimeWarning")
-def test_who_waits_elsewhere_is_told_of_a_death(
+def test_waiters_elsewhere_learn_of_a_death(
     here: Any, far: Far, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one = far(here)

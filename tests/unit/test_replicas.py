@@ -63,7 +63,9 @@ def kept(hosts: Hosts, name: str) -> Callable[[], bool]:
 # Writes
 
 
-def test_a_write_is_seen_by_whoever_hears_of_it(hosts: Hosts, wires: tuple[Wire, Wire]) -> None:
+def test_a_write_is_seen_by_every_process_that_learns_of_it(
+    hosts: Hosts, wires: tuple[Wire, Wire]
+) -> None:
     there, back = Pipe(hosts, "a", "b"), Pipe(hosts, "b", "a")
     with hosts.at("a"):
         array = fiber.RawArray("i", [1, 2, 3])
@@ -190,7 +192,9 @@ def replicas(hosts: Hosts) -> Iterator[Replicas]:
 
 
 @pytest.mark.parametrize(("home", "reason"), [("a", "is gone"), ("c", "'c' cannot be reached")])
-def test_who_may_not_have_it_is_told_why(replicas: Replicas, home: str, reason: str) -> None:
+def test_a_process_without_the_right_gets_the_reason(
+    replicas: Replicas, home: str, reason: str
+) -> None:
     asker = Asker()
     origin = Origin(home, NO_SECRET, 8, NO_SECRET, NO_SECRET)
     replicas.join(origin, asker, asker)
@@ -198,7 +202,7 @@ def test_who_may_not_have_it_is_told_why(replicas: Replicas, home: str, reason: 
     assert not replicas._replicas
 
 
-def test_what_others_have_is_not_had_without_its_secrets(far: Far, hosts: Hosts) -> None:
+def test_objects_of_others_cannot_be_used_without_their_secrets(far: Far, hosts: Hosts) -> None:
     with hosts.at("a"):
         array = fiber.RawArray("i", 3)
     other = far(array)

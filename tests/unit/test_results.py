@@ -104,7 +104,7 @@ def test_results_that_come_early_wait_for_their_turn() -> None:
     assert [found.next(0) for _ in range(4)] == [0, 1, 2, 3]
 
 
-def test_waiting_for_an_iterator_in_vain_leaves_nothing() -> None:
+def test_a_timed_out_wait_for_an_iterator_leaves_no_waiter() -> None:
     found = iterator()
     for _ in range(3):
         with pytest.raises(TimeoutError):
@@ -117,7 +117,7 @@ def test_waiting_for_an_iterator_in_vain_leaves_nothing() -> None:
     assert found._buffer._waiters._locks == []
 
 
-def test_all_who_wait_for_an_iterator_go_on() -> None:
+def test_all_waiters_for_an_iterator_go_on() -> None:
     found = iterator()
     values: list[Any] = []
     threads = [threading.Thread(target=lambda: values.extend(found)) for _ in range(5)]

@@ -102,7 +102,7 @@ class Losing:
         return {int(path.name): path.read_text() for path in self.folder.iterdir()}
 
 
-def test_all_hear_of_a_member_that_is_killed(tmp_path: Path) -> None:
+def test_all_members_learn_of_a_killed_member(tmp_path: Path) -> None:
     losing = Losing("kill", tmp_path)
     with pytest.raises(MemberLost, match=r"member 1 of the ring is lost: .*SIGKILL") as caught:
         fiber.Ring(4, losing).run()
@@ -119,7 +119,7 @@ def test_an_exit_is_a_loss(tmp_path: Path) -> None:
     assert set(losing.heard()) == {0, 2}
 
 
-def test_what_a_member_raises_is_raised(tmp_path: Path) -> None:
+def test_an_exception_of_a_member_is_raised(tmp_path: Path) -> None:
     losing = Losing("raise", tmp_path)
     with pytest.raises(ValueError, match="no such device") as caught:
         fiber.Ring(3, losing).run()
@@ -166,7 +166,7 @@ def wait_for_who_has_returned(rank: int, size: int) -> str:
     return "nothing"
 
 
-def test_who_has_returned_sends_no_more() -> None:
+def test_a_returned_member_sends_no_message() -> None:
     assert fiber.Ring(2, wait_for_who_has_returned).run() == ["early", "it has returned"]
 
 
@@ -236,7 +236,7 @@ def test_bad_arguments(arguments: Any, error: type[Exception], says: str) -> Non
         fiber.Ring(*arguments)
 
 
-def test_what_does_not_pickle_starts_nobody() -> None:
+def test_arguments_that_do_not_pickle_start_no_member() -> None:
     with pytest.raises(fiber.UnpicklableError):
         fiber.Ring(2, ranks, keep, [(n for n in range(3))]).run()
     assert not fiber.active_children()

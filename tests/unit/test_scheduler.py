@@ -93,7 +93,7 @@ def test_it_grows_with_the_work_up_to_its_maximum() -> None:
     assert scheduler.decide(0.0).start == 0
 
 
-def test_who_is_gone_is_replaced_and_its_task_runs_elsewhere() -> None:
+def test_a_lost_worker_is_replaced_and_its_task_runs_elsewhere() -> None:
     scheduler, members = pool(1)
     job = job_of(scheduler, 1)
     (batch,) = scheduler.decide(0.0).assign
@@ -126,7 +126,7 @@ def test_a_worker_that_did_all_it_may_is_dismissed_and_replaced() -> None:
     assert scheduler.decide(0.0).dismiss == []
 
 
-def test_idle_workers_ask_for_what_busy_ones_have_not_read() -> None:
+def test_idle_workers_ask_for_unread_tasks_of_busy_ones() -> None:
     scheduler, _ = pool(2)
     job_of(scheduler, 4)
     decisions = scheduler.decide(0.0)
@@ -253,7 +253,7 @@ def test_who_waits_for_a_newcomer_hears_that_none_starts_while_others_work() -> 
 # Lending
 
 
-def test_a_worker_is_lent_while_nobody_needs_it() -> None:
+def test_a_worker_is_leased_while_it_is_not_needed() -> None:
     scheduler, members = pool(1)
     worker = members[0].ready
     assert scheduler.lease(worker)
@@ -281,7 +281,7 @@ def test_no_worker_is_lent_that_has_something_to_do_or_could_have() -> None:
     assert not scheduler.lease(members[0].ready), "its tasks are counted"
 
 
-def test_a_closed_pool_needs_those_that_are_lent() -> None:
+def test_a_closed_pool_needs_its_leased_workers() -> None:
     scheduler, members = pool(1)
     assert scheduler.lease(members[0].ready)
     scheduler.close()
@@ -291,7 +291,7 @@ def test_a_closed_pool_needs_those_that_are_lent() -> None:
     assert scheduler.decide(0.0).dismiss == members
 
 
-def test_a_lent_worker_counts_as_busy_when_more_are_wanted() -> None:
+def test_a_leased_worker_counts_as_busy_when_more_are_wanted() -> None:
     scheduler, members = pool(1, 2)
     assert scheduler.lease(members[0].ready)
     job_of(scheduler, 1)
@@ -327,7 +327,7 @@ def test_what_a_returned_worker_runs_for_nobody_holds_it_up_and_no_more() -> Non
     assert scheduler.decide(0.0).dismiss == members
 
 
-def test_a_lent_worker_that_is_gone_is_replaced() -> None:
+def test_a_lost_leased_worker_is_replaced() -> None:
     scheduler, members = pool(1)
     worker = members[0].ready
     assert scheduler.lease(worker)
@@ -344,7 +344,7 @@ def test_a_lent_worker_that_is_gone_is_replaced() -> None:
 # The end
 
 
-def test_a_closed_pool_does_what_is_there_and_then_ends() -> None:
+def test_a_closed_pool_finishes_its_tasks_and_then_ends() -> None:
     scheduler, members = pool(2)
     job_of(scheduler, 5)
     scheduler.close()
@@ -389,7 +389,7 @@ def test_a_pool_without_workers_that_is_closed_is_over() -> None:
     assert scheduler.decide(0.0).over
 
 
-def test_a_terminated_pool_ends_all_it_has_and_starts_nobody() -> None:
+def test_a_terminated_pool_ends_all_workers_and_starts_none() -> None:
     scheduler, members = pool(2)
     starting = Member()
     scheduler.starting(starting)

@@ -73,7 +73,7 @@ def test_it_is_multiprocessings(memory: SharedMemory) -> None:
     assert (again.buf[0], again.name, again.size) == (5, memory.name, memory.size)
 
 
-def test_what_a_process_made_outlives_it() -> None:
+def test_shared_memory_outlives_the_process_that_made_it() -> None:
     name = f"fiber-test-{os.getpid()}"
     run(make, name)
     memory = SharedMemory(name)
@@ -100,7 +100,7 @@ def test_bad_options(options: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("name", [5, 0, b"name", ["name"]])
-def test_what_is_no_name_is_refused(name: Any) -> None:
+def test_an_invalid_name_is_refused(name: Any) -> None:
     for options in ({}, {"create": True, "size": 5}):
         with pytest.raises(TypeError, match="'name' must be a string, not"):
             SharedMemory(name, **options)
@@ -115,7 +115,7 @@ def test_a_list_is_shared() -> None:
     numbers.shm.unlink()
 
 
-def test_a_manager_removes_what_it_made() -> None:
+def test_a_manager_removes_its_shared_memory() -> None:
     manager = SharedMemoryManager()
     with pytest.raises(ValueError, match="does not run"):
         manager.SharedMemory(size=10)
@@ -134,7 +134,7 @@ def test_a_manager_removes_what_it_made() -> None:
 
 
 @pytest.mark.parametrize("end", ["pass", "os.kill(os.getpid(), signal.SIGKILL)"])
-def test_nothing_is_left_of_what_nobody_unlinked(end: str) -> None:
+def test_memory_that_was_never_unlinked_is_removed_at_the_end(end: str) -> None:
     program = (
         "import fiber, os, signal\n"
         "from fiber.shared_memory import SharedMemory\n"
@@ -152,7 +152,7 @@ def test_nothing_is_left_of_what_nobody_unlinked(end: str) -> None:
     assert wait_until(lambda: not there_is(name), PATIENCE)
 
 
-def test_another_host_is_told_what_to_use(memory: SharedMemory) -> None:
+def test_another_host_learns_the_replacement(memory: SharedMemory) -> None:
     hosts = Hosts()
     try:
         with hosts.at("here"):

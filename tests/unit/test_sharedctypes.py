@@ -176,7 +176,7 @@ def test_pool_initializers_get_them() -> None:
     assert list(array) == [4, 4, 4]
 
 
-def test_what_a_process_made_outlives_it() -> None:
+def test_a_shared_value_outlives_the_process_that_made_it() -> None:
     back = fiber.SimpleQueue()
     process = start(_send_new, back)
     array = back.get()

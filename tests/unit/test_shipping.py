@@ -281,7 +281,7 @@ assert ctypes.CDLL(None).capset(struct.pack("Ii", 0x20080522, 0), bytes(24)) == 
 """
 
 
-def test_a_listing_leaves_out_what_cannot_be_read(site: Site) -> None:
+def test_a_listing_omits_unreadable_files(site: Site) -> None:
     write(site.program, data_txt="text", closed_txt="text", folder__in_txt="text", hidden__x="x")
     for name, mode in (("closed.txt", 0), ("folder", 0), ("hidden", 0o400)):
         (site.program / name).chmod(mode)

@@ -159,7 +159,7 @@ def run_schedule(seed: int) -> None:
     cuts=st.sets(st.integers(0, 60)),
     seed=st.integers(0, 2**32),
 )
-def test_a_break_at_any_step_loses_nothing(sizes: list[int], cuts: set[int], seed: int) -> None:
+def test_a_break_at_any_step_loses_no_frame(sizes: list[int], cuts: set[int], seed: int) -> None:
     network = Network(random.Random(seed))
     for number, size in enumerate(sizes):
         network.send(number % 2, bytes([number]) * size)
@@ -233,7 +233,7 @@ def test_a_large_piece_is_sent_from_where_it_is() -> None:
     assert isinstance(one.outgoing(0)[0], bytes), "small ones are put together at once"
 
 
-def test_the_window_bounds_what_is_under_way_in_bytes() -> None:
+def test_the_window_bounds_the_unconfirmed_bytes() -> None:
     one, other = pair()
     frame = bytes(2 * WINDOW_BYTES - BUDGET)
     one.send(frame)
@@ -251,7 +251,7 @@ def test_the_window_bounds_what_is_under_way_in_bytes() -> None:
     assert [f for datagram in second for f in other.received(datagram, 0)] == [frame]
 
 
-def test_the_window_bounds_what_is_under_way_in_number() -> None:
+def test_the_window_bounds_the_unconfirmed_frames() -> None:
     one, other = pair()
     datagrams = []
     for number in range(2 * WINDOW):
@@ -269,7 +269,7 @@ def test_the_window_bounds_what_is_under_way_in_number() -> None:
     assert len(other.received(rest, 0)) == WINDOW, "what waited travels together"
 
 
-def test_request_and_reply_need_no_acknowledgement_of_their_own() -> None:
+def test_request_and_reply_need_no_separate_acknowledgement() -> None:
     one, other = pair()
     now = 0.0
     for number in range(10):
@@ -326,7 +326,7 @@ def test_a_repetition_is_dropped_and_acknowledged_at_once() -> None:
     assert other.statistics().repeated == 1
 
 
-def test_nothing_leaves_while_disconnected_and_all_of_it_afterwards() -> None:
+def test_frames_wait_while_disconnected_and_leave_afterwards() -> None:
     one, other = pair()
     one.send(b"under way")
     one.outgoing(0)

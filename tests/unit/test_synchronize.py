@@ -49,7 +49,7 @@ def test_a_semaphore_is_a_context() -> None:
     assert semaphore.get_value() == 1
 
 
-def test_a_bounded_semaphore_refuses_what_was_not_acquired() -> None:
+def test_a_bounded_semaphore_refuses_a_surplus_release() -> None:
     semaphore = fiber.BoundedSemaphore(2)
     with pytest.raises(ValueError, match="too many times"):
         semaphore.release()
@@ -107,7 +107,7 @@ def announce_and_acquire(semaphore: Any, ready: Any) -> None:
     semaphore.acquire()
 
 
-def test_who_is_killed_while_waiting_takes_nothing() -> None:
+def test_a_waiter_killed_while_waiting_takes_no_token() -> None:
     semaphore, ready = fiber.Semaphore(0), fiber.Event()
     process = start(announce_and_acquire, semaphore, ready)
     assert ready.wait(PATIENCE)
@@ -152,7 +152,7 @@ def test_an_event_wakes_all_processes() -> None:
         process.join(PATIENCE)
 
 
-def test_who_waits_is_woken_even_if_the_event_is_cleared_at_once() -> None:
+def test_a_waiter_is_woken_even_if_the_event_is_cleared_at_once() -> None:
     event = fiber.Event()
     woken: list[bool] = []
     for _ in range(50):

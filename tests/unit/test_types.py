@@ -111,7 +111,7 @@ def test_a_users_program_has_the_types_that_it_has_with_multiprocessing(findings
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-def test_what_fiber_adds_has_types_and_mistakes_are_errors(findings: Findings) -> None:
+def test_fibers_additions_have_types_and_mistakes_are_errors(findings: Findings) -> None:
     found = findings["additions.py"]
     lines = enumerate((TYPED / "additions.py").read_text(encoding="utf-8").splitlines(), 1)
     said = {number: match[1] for number, line in lines if (match := re.search(r"  # (.+)", line))}

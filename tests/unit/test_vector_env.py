@@ -97,7 +97,7 @@ def play_both(env: VectorEnv, sync: SyncVectorEnv, steps: int = 12) -> None:
 
 
 @pytest.mark.parametrize("space", SPACES)
-def test_it_gives_what_sync_vector_env_gives(space: str, vector_env: Make) -> None:
+def test_it_gives_the_same_as_sync_vector_env(space: str, vector_env: Make) -> None:
     makes = [partial(Sampling, SPACES[space], length=3 + number % 3) for number in range(5)]
     play_both(vector_env(makes), SyncVectorEnv(makes))
 
@@ -310,7 +310,7 @@ def test_first_ready(vector_env: Make) -> None:
     assert len(env.recv()[0]) == 5
 
 
-def test_what_is_ready_does_not_wait_for_what_is_slow(vector_env: Make, tmp_path: Any) -> None:
+def test_ready_environments_do_not_wait_for_slow_ones(vector_env: Make, tmp_path: Any) -> None:
     gate = tmp_path / "gate"
     env = vector_env([partial(Faulty, gate)] * 4)  # in each worker one that waits
     env.reset()
@@ -386,7 +386,7 @@ def test_registered(monkeypatch: pytest.MonkeyPatch) -> None:
         env.close()
 
 
-def test_a_learner_that_forgets_it_leaves_nothing(vector_env: Make) -> None:
+def test_a_learner_that_drops_it_leaves_no_process(vector_env: Make) -> None:
     env = VectorEnv([Faulty], num_workers=1)
     workers: list[WorkerProcess] = list(env._sub_environments.dispatcher._workers)
     assert workers[0].process.is_alive()

@@ -57,12 +57,14 @@ def told(
     return answers
 
 
-def test_quick_ones_are_told_together(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_quick_environments_are_reported_together(monkeypatch: pytest.MonkeyPatch) -> None:
     for shared in (True, False):
         assert told(monkeypatch, [0.01 * MS] * ROWS, shared=shared) == [None]
 
 
-def test_what_is_done_does_not_wait_for_a_slow_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_finished_environment_does_not_wait_for_a_slow_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     slow_at_the_end = [0.01 * MS, 0.01 * MS, 0.01 * MS, 5 * MS]
     for shared in (True, False):
         assert told(monkeypatch, slow_at_the_end, shared=shared) == [[0, 1, 2], [3]]

@@ -388,7 +388,7 @@ def count_a_little(x: int) -> int:
     return x
 
 
-def test_sigint_between_tasks_is_nothing(rig: Rig) -> None:
+def test_sigint_between_tasks_has_no_effect(rig: Rig) -> None:
     rig.give(abs, range(3))
     rig.worker.interrupt(signal.SIGINT, None)
 

@@ -252,7 +252,7 @@ def test_workers_that_die_idle_again_and_again_are_replaced_slowly(workers: Pool
     assert workers.error is None
 
 
-def test_who_dies_at_work_is_replaced_at_once(workers: PoolWorkerSet) -> None:
+def test_a_worker_that_dies_at_work_is_replaced_at_once(workers: PoolWorkerSet) -> None:
     batch: Any = object()
     for _ in range(100):
         member = start(workers, ready=True)

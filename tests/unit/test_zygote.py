@@ -168,7 +168,7 @@ def test_a_signal_right_after_the_birth_is_not_lost(master: Master) -> None:
     assert [a[2] for a in answers if a[0] == zygote.EXITED] == [-signal.SIGTERM] * 20
 
 
-def test_many_deaths_at_once_are_all_told(master: Master) -> None:
+def test_many_simultaneous_deaths_are_all_reported(master: Master) -> None:
     pids = [master.started(number) for number in range(10)]
     for pid in pids:
         os.kill(pid, signal.SIGKILL)
@@ -176,7 +176,7 @@ def test_many_deaths_at_once_are_all_told(master: Master) -> None:
     assert answers == {(zygote.EXITED, number, -signal.SIGKILL) for number in range(10)}
 
 
-def test_told_to_quit_it_kills_and_reports_its_children(master: Master) -> None:
+def test_quit_kills_and_reports_the_children(master: Master) -> None:
     pids = [master.started(number) for number in range(3)]
     master.say(zygote.QUIT)
     answers = {master.hear() for _ in pids}
@@ -247,7 +247,7 @@ def test_it_removes_the_directory_of_an_agent_that_was_killed(moment: str, tmp_p
     assert census.wait_until(lambda: not directory.exists(), PATIENCE)
 
 
-def test_told_to_quit_it_leaves_the_directory_to_its_agent(
+def test_quit_leaves_the_directory_to_the_agent(
     progress_table: ProgressTable, tmp_path: Path
 ) -> None:
     master = Master(progress_table, cleanup_directory=str(tmp_path))
@@ -375,7 +375,7 @@ def inside(progress_table: ProgressTable) -> Iterator[tuple[zygote.Zygote, socke
     theirs.close()
 
 
-def test_a_refused_fork_is_told_and_leaks_nothing(
+def test_a_refused_fork_is_reported_and_leaks_no_descriptor(
     inside: tuple[zygote.Zygote, socket.socket], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse() -> int:
@@ -441,7 +441,7 @@ def test_what_came_ahead_of_a_start_that_never_came_is_closed(master: Master) ->
     master.say(zygote.SIGNAL, 2, signal.SIGKILL)
 
 
-def test_descriptors_that_nobody_took_are_closed_in_the_child(
+def test_untaken_descriptors_are_closed_in_the_child(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     reader, writer = os.pipe()
@@ -549,7 +549,7 @@ def test_the_first_pool_starts_it_before_it_imports_the_rest(backend: str, zygot
     assert int(_run(script, expect=0, env=environ)) == zygotes
 
 
-def test_a_worker_imports_nothing_that_it_does_not_need() -> None:
+def test_a_worker_imports_no_unneeded_module() -> None:
     script = """
         import fiber
         heavy = {"cloudpickle", "dataclasses", "fiber.config", "fiber._runtime.state", "traceback"}
