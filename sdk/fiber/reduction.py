@@ -60,7 +60,10 @@ REFUSALS = (TypeError, pickle.PicklingError)
 """Errors that picklers raise for objects that they cannot pickle."""
 
 _DEPTH = 20
+"""Largest number of steps from an object to the part that does not pickle."""
+
 _BREADTH = 1000
+"""Largest number of parts of one object that are tried."""
 
 
 class PayloadDescriptor:
@@ -122,7 +125,7 @@ def dump_process(process: Any, *, same_host: bool) -> tuple[bytes, list[Descript
     try:
         return _dump_process(process, Spawning(process) if same_host else RemoteSpawning(process))
     finally:
-        mp_context.set_spawning_popen(None)  # again: the call below may have been interrupted
+        mp_context.set_spawning_popen(None)  # again: an interrupt can skip the first
 
 
 def _dump_process(process: Any, popen: Any) -> tuple[bytes, list[Descriptor]]:

@@ -127,7 +127,7 @@ def dated(
 
 
 def phase(pool: FiberPool, found: Sequence[PoolCondition], outlook: Outlook) -> Phase:
-    """Return the conditions in one word."""
+    """Return the phase, which sums up the conditions in one word."""
     status = {condition.type: condition.status for condition in found}
     if pool.metadata.deletion_timestamp is not None:
         return Phase.TERMINATING

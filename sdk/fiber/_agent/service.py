@@ -30,7 +30,7 @@ from fiber._wire.descriptor import contents
 from fiber._wire.memory_files import Blob, BytesLike, pass_on, place_of
 
 _KNOWN_HERE = ExitReport._fields.index("pod")
-"""Fields of an exit report that an agent knows; the master adds the others."""
+"""Number of fields of an exit report that an agent sends; the master adds the others."""
 
 _BACKLOG = 4 << 20
 """Bytes of one child's output, or of one of its messages, that may wait for the link.  Above that

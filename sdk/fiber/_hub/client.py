@@ -172,7 +172,7 @@ class Reply:
 
 
 class HubStream:
-    """Stream to the hub ``home``.  To open one does not wait."""
+    """Stream to the hub ``home``.  Opening one does not wait for the hub."""
 
     def __init__(self, home: HubAddress, greeting: Iterable[bytes] = ()) -> None:
         self._host = home.host
@@ -180,6 +180,7 @@ class HubStream:
         self._asked = 0
         """Number of the last request that gets a reply."""
         self._unsettled: Op | None = None
+        """Operation of a request whose reply is awaited or was given up."""
         self._begun: int | None = None
         """Number of the request that ``begin`` sent and ``finish`` has not read."""
         self._end = "its hub is gone"

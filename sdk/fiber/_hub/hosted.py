@@ -171,8 +171,8 @@ class HostedChannel:
 class HostedReceiver(HostedChannel):
     """Receiving end of a one-way channel.
 
-    While a request waits, it looks at the backlog each second.  A process of this host that dies
-    with the wake-up packet does not wake other readers.
+    While a request waits, it looks at the backlog each second.  A process of this host may have
+    taken the packet that wakes readers, and died before it woke the next one.
     """
 
     def __init__(self, loop: Loop, poller: Poller, channel: ReceivingEnd) -> None:
@@ -297,7 +297,7 @@ class HostedSemaphore:
     def __init__(self, loop: Loop, doorbell: Doorbell, block: SharedBlock) -> None:
         self._loop = loop
         self._doorbell = doorbell
-        # A separate view, not a recursive one, as this process does not use the tokens itself.
+        # COUNTING also for a recursive lock: this process acquires tokens for others.
         self._semaphore = SharedSemaphore(block, COUNTING)
         self._waiters: deque[tuple[Waiter, Callable[[bool], None]]] = deque()
         self._is_listening = False

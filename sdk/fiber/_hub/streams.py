@@ -5,8 +5,9 @@ A tunnel is a stream between the hubs of two hosts, over the links between agent
     process ── unix stream ── its hub ══ link ══ master ══ link ══ another hub
                                 │ splice              │ splice         │ handler
 
-A link carries many tunnels and all other messages; it lets large messages take turns.  A tunnel has
-at most WINDOW bytes and a message on the way: the receiver gives credit as it passes messages on.
+A link carries many tunnels and all other messages; it lets large messages take turns.  At
+most WINDOW bytes and one message of a tunnel are on the way: the receiver gives credit as it passes
+messages on.
 The payload of a frame begins with its kind:
 
     MESSAGE  the payload follows the kind; the frame's buffers are the message's

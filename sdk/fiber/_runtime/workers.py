@@ -42,7 +42,7 @@ class WorkerResources:
 
     @property
     def chosen(self) -> Resources:
-        """Resources that workers get.  The first use settles them."""
+        """Resources that workers get.  They do not change after the first read."""
         return self._chosen.setdefault("resources", self._own)
 
     def choose_for(self, function: Callable[..., Any]) -> None:
@@ -64,7 +64,7 @@ class Supervisor(Protocol):
         """Take a packet from a worker."""
 
     def on_recalled(self, handle: WorkerHandle, seqs: list[int]) -> None:
-        """Have the tasks of batches wait again that the worker will never read."""
+        """Queue the tasks of these batches again: the worker will never read the batches."""
 
     def on_draining(self, handle: WorkerHandle) -> None:
         """Replace the worker: its host is about to end."""
@@ -81,7 +81,7 @@ class WorkerHandle:
     """
 
     sentinel = -1
-    """Placeholder that a Process reads when it starts.  The first use makes a real sentinel."""
+    """Placeholder that a Process reads when it starts.  ``exit_descriptor`` has the real one."""
 
     def __init__(self, supervisor: Supervisor, runtime: Runtime, shared: SharedArguments) -> None:
         self.process: BaseProcess | None = None

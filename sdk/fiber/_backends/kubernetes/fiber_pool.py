@@ -82,7 +82,7 @@ class PoolObserver(Protocol):
         """Take a pod's present document; None once the pod is deleted."""
 
     def on_lease_expired(self) -> None:
-        """Note that another program may become the pool's master unnoticed."""
+        """Note that the Lease has expired: another program may become the pool's master."""
 
     def on_warning(self, message: str) -> None:
         """Report a problem that may pass."""

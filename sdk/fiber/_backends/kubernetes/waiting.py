@@ -117,7 +117,7 @@ class WaitingChildren:
         self._agents.refuse_waiting(error)
 
     def look(self, most: int) -> None:
-        """Check the waiting children after a change, with ``most`` pods at most."""
+        """Check the waiting children after a change; ``most`` is the largest number of pods."""
         placement = self._placement
         alone = self._alone
         known = self._agents.error or failure(self.pool, self.status, 0) or self._unreachable()
