@@ -108,7 +108,7 @@ _PASSES = frozenset({401, 410})
 
 
 class WatchStatus:
-    """State of the watches.  ``namespaces`` are those that are watched; empty: all."""
+    """State of the watches.  ``namespaces``: the watched namespaces; empty: all."""
 
     def __init__(self, namespaces: Sequence[str]) -> None:
         self._needed = [
@@ -188,7 +188,7 @@ def _asked(request: aiohttp.TraceRequestEndParams) -> str:
 FIRST_PAUSE = 1.0
 LONGEST_PAUSE = 30.0
 TOGETHER = 0.02
-"""Seconds for which what happens is gathered."""
+"""Seconds for which kopf gathers the events of an object before it handles them."""
 END_WAIT = 4.0
 """Seconds for kopf to end; its thread does not keep the process from ending."""
 
@@ -216,7 +216,7 @@ class _Patience:
 
 
 class _NoDiffs(kopf.DiffBaseStorage):
-    """Keeps kopf from comparing objects with what annotations say of their past."""
+    """Storage without contents: kopf compares no object with an earlier state of it."""
 
     def build(self, **_: Any) -> kopf.BodyEssence:
         return kopf.BodyEssence()
@@ -235,7 +235,7 @@ def registry(
     answered: Answered,
     sessions: list[aiohttp.ClientSession],
 ) -> kopf.OperatorRegistry:
-    """The handlers: each says which object it is about and returns nothing."""
+    """Return the handlers.  Each reports which object an event is about."""
     handlers = kopf.OperatorRegistry()
 
     @kopf.on.login(registry=handlers)

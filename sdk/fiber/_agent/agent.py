@@ -277,7 +277,7 @@ _SEQ = struct.Struct("<Q")
 
 _NO_ROOM = (TooManyOpenFiles, MemoryError)
 _LOST = (*_NO_ROOM, ValueError, struct.error)
-"""Errors that lose a packet: it was taken from its socket and cannot be delivered."""
+"""Errors that lose a packet, which was taken from its socket and cannot be delivered."""
 
 
 class LocalChild:
@@ -355,7 +355,7 @@ class LocalChild:
         zygote.start(self.id, request, fds)
 
     def leave_zygote(self) -> None:
-        """Stop counting the child among those of its zygote: it is gone, or gets another one."""
+        """Stop counting the child as its zygote's: the child is gone, or gets another zygote."""
         if self.zygote is not None:
             self.zygote.children -= 1
 
@@ -406,7 +406,7 @@ class LocalChild:
         return outbox is not None and outbox.send(b"".join((_SEQ.pack(seq), payload)), buffers)
 
     def lend(self) -> LocalTaskChannel | None:
-        """Return the channel for direct use; None if there is none, or no descriptor is left."""
+        """Return the task channel for direct use; None if it is gone, or without descriptors."""
         if self._ours is None or self._ours.fileno() < 0:
             return None
         try:

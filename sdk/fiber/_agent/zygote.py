@@ -128,7 +128,7 @@ class Zygote:
             signal.signal(signum, signal.SIG_IGN)
         # A terminal with `stty tostop` stops background process groups that print.
         signal.signal(signal.SIGTTOU, signal.SIG_IGN)
-        # A new child ignores TELL until it has undone this function's work: see signals.py.
+        # A new child ignores TELL until ``_run_child`` has reset its signal handlers.
         signal.signal(last_words.TELL, signal.SIG_IGN)
         signal.signal(signal.SIGCHLD, lambda *_: None)
         signal.set_wakeup_fd(self._sigchld_in, warn_on_full_buffer=False)

@@ -157,7 +157,7 @@ class Registry:
         return hmac.digest(self._secret, struct.pack("<3Q", *known), "sha256")[:SECRET_BYTES]
 
     def release(self, grants: Iterable[bytes]) -> None:
-        """Have the loop end ``grants``, which no process uses from now on."""
+        """Ask the loop to end ``grants``, which no process uses from now on."""
         self._call_soon(self.take_back, grants)
 
     def take_back(self, grants: Iterable[bytes]) -> None:

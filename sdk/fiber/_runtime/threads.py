@@ -53,7 +53,7 @@ class BackgroundThread:
         self._thread = thread
 
     def submit(self, action: Callable[..., object], *args: Any) -> bool:
-        """Have ``action`` done after those before it; return False if the thread was stopped.
+        """Run ``action`` on the thread, after earlier ones; return False if the thread was stopped.
 
         RuntimeError if the system has no room for the thread; the next call tries again.
         """

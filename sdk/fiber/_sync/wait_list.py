@@ -25,12 +25,12 @@ WAIT_LIST_SIZE = 1 << 15
 # Words of 8 bytes
 _TICKET = 0
 _USERS = 1
-_END = 3  # of the places that were ever taken
+_END = 3  # end of the places that were ever taken
 _PLACES = range(8, WAIT_LIST_SIZE // 8, 8)
 # Words of a place
 _STATE = 0
 _WHO = 1  # identity of the process; 0 if the place is free
-_CAME = 2
+_CAME = 2  # ticket: the order in which the threads came
 _HELD = 3  # number of things, set by ``hold``
 _BELL = 4
 _WAITS, _WAITS_AFAR, _LOST, _NOTIFIED = range(4)
@@ -54,7 +54,7 @@ class WaitList:
         self._words = block.view.cast("q")
 
     def enter(self, *, afar: bool = False) -> int:
-        """Take a place for this thread; ``afar``: for a process of another host."""
+        """Take a place for this thread; ``afar``: it is for a process of another host."""
         words = self._words
         place = self._free_place()
         words[_END] = max(words[_END], place + _PLACES.step)
