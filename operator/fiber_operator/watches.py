@@ -188,7 +188,7 @@ def _asked(request: aiohttp.TraceRequestEndParams) -> str:
 FIRST_PAUSE = 1.0
 LONGEST_PAUSE = 30.0
 TOGETHER = 0.02
-"""Seconds for which kopf gathers the events of an object before it handles them."""
+"""Seconds for which notices are gathered before they are passed to the loop together."""
 END_WAIT = 4.0
 """Seconds for kopf to end; its thread does not keep the process from ending."""
 
@@ -455,7 +455,8 @@ class KopfThread:
 
     def _tell(self, listener: Callable[..., None], *told: object) -> None:
         self._untold.append(functools.partial(listener, *told))
-        # Waking the other loop costs more than what is told: once for all that comes together.
+        # To wake the other loop costs more than a notice.  So one wake-up brings all notices that
+        # arrive within TOGETHER seconds.
         if len(self._untold) == 1 and self._loop is not None:
             self._loop.call_later(TOGETHER, self._call, self._pass_on)
 
