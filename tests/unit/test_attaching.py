@@ -124,7 +124,9 @@ def lend(
 
 
 @pytest.fixture
-def worker() -> Iterator[tuple[BatchRunner, Results]]:
+def worker(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[BatchRunner, Results]]:
+    """Make a worker whose watchdog splits no batch, however slow the machine is."""
+    monkeypatch.setattr("fiber._agent.worker.Watchdog.begin", lambda self, batch: None)
     results = Results()
     worker = BatchRunner(results, memoryview(bytearray(16)).cast("Q"))
     yield worker, results
