@@ -35,13 +35,18 @@ def ran(directory: Path, times: int) -> bool:
     return len(notes(directory)) >= times
 
 
-def begin_and_wait(task: tuple[Path, int]) -> str:
+def begin_and_wait(task: tuple[Path, object]) -> str:
     """Run until there is a file, and return the host."""
     directory, number = task
     note(directory, str(number))
     while not (directory / "go").exists():
         time.sleep(0.01)
     return str(number)
+
+
+def begin_somewhere_and_wait(task: tuple[Path, int]) -> str:
+    directory, number = task
+    return begin_and_wait((directory, f"{number}@{client.host()}"))
 
 
 def block_unless_it_ran(directory: Path) -> int:
@@ -139,6 +144,25 @@ def test_running_tasks_end_and_run_only_once(site: Site, tmp_path: Path) -> None
         wait_for(lambda: bool(hosts_of(pool) - before - {""}))
         (tmp_path / "go").touch()
         assert results.get(PATIENCE) == [str(n) for n in range(12)]
+    assert set(Counter(notes(tmp_path)).values()) == {1}
+
+
+@patient
+@pytest.mark.parametrize("chunksize", [6, 12])
+def test_a_drained_worker_begins_no_more_tasks_of_its_chunk(
+    site: Site, tmp_path: Path, chunksize: int
+) -> None:
+    with fiber.Pool(2, retries=1, disruptions=0) as pool:
+        tasks = [(tmp_path, n) for n in range(2 * chunksize)]
+        results = pool.map_async(begin_somewhere_and_wait, tasks, chunksize=chunksize)
+        wait_for(lambda: len(notes(tmp_path)) == 2)
+        drained_host = min(hosts_of(pool))
+        agent = site.drain(drained_host)
+        (tmp_path / "go").touch()
+        wait_for(lambda: agent.lost is not None)
+        ran = [result.split("@") for result in results.get(PATIENCE)]
+    assert [number for number, _ in ran] == [str(n) for n in range(2 * chunksize)]
+    assert [host for _, host in ran].count(drained_host) == 1
     assert set(Counter(notes(tmp_path)).values()) == {1}
 
 

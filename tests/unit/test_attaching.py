@@ -128,7 +128,7 @@ def worker(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[BatchRunner, Resul
     """Make a worker whose watchdog splits no batch, however slow the machine is."""
     monkeypatch.setattr("fiber._agent.worker.Watchdog.begin", lambda self, batch: None)
     results = Results()
-    worker = BatchRunner(results, memoryview(bytearray(16)).cast("Q"))
+    worker = BatchRunner(results, memoryview(bytearray(24)).cast("Q"))
     yield worker, results
     worker.close()
 

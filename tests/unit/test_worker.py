@@ -64,7 +64,7 @@ class Rig:
 
     def __init__(self, retryable: tuple[type[BaseException], ...] = ()) -> None:
         self.channel = Channel()
-        self.progress = memoryview(bytearray(16)).cast("Q")
+        self.progress = memoryview(bytearray(24)).cast("Q")
         self.worker = BatchRunner(self.channel, self.progress, retryable)
         self._seq = 0
 

@@ -439,6 +439,12 @@ class LocalChild:
         """Take back unread packets; ``observer.recalled`` gets the answer on the loop thread."""
         self._loop.call_soon(self._send_recalled)
 
+    def drain(self) -> None:
+        """Take back the tasks that a worker has not begun: its host is about to end."""
+        if self.slot is not None:
+            self._agent.progress_table.stop(self.slot)
+        self.recall()
+
     def signal(self, signum: int) -> None:
         """Signal the child through its zygote."""
         if self._loop.broken:

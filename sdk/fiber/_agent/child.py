@@ -101,7 +101,7 @@ def task_channel() -> UnixChannel:
 
 
 def progress() -> memoryview:
-    """Return two words of shared memory: sequence number and index of the running task.
+    """Return shared words: number of the batch, index of the running task, whether to stop.
 
     Only in a pool worker.  Set the sequence number to zero before another batch's index is written,
     and to its value last.  The agent, which reads the words after a crash, must never see one

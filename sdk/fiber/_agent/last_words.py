@@ -80,7 +80,7 @@ def _without_our_frames(lines: Iterable[str]) -> list[str]:
     return kept
 
 
-_SLOT = 2  # words: sequence number of the batch, index of the task in it
+_SLOT = 3  # words: sequence number of the batch, index of the task in it, whether to stop
 _SLOTS = 1 << 16  # sparse: only pages that are used exist
 
 
@@ -112,15 +112,19 @@ class ProgressTable:
                     f"one agent runs at most {_SLOTS} pool workers at a time"
                 ) from None
         view = self.slot(slot)
-        view[0] = view[1] = 0
+        view[0] = view[1] = view[2] = 0
         return slot
+
+    def stop(self, slot: int) -> None:
+        """Have a worker return the tasks that it has not begun, whatever chunk they are of."""
+        self.slot(slot)[2] = 1
 
     def release(self, slot: int) -> None:
         """Free the slot of a child that is gone."""
         self._free.append(slot)
 
     def slot(self, slot: int) -> memoryview:
-        """Return the two words of a slot: sequence number (0: none) and index."""
+        """Return the words of a slot: sequence number (0: none), index, whether to stop."""
         return self._words[slot * _SLOT : (slot + 1) * _SLOT]
 
     def running(self, slot: int) -> tuple[int, int] | None:

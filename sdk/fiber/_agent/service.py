@@ -230,12 +230,12 @@ class _Observed:
         self.exited(ExitReport(1, f"could not be started: {why}", host=host, cause=cause))
 
     def leave(self) -> None:
-        """Take back a worker's unread batches, or send SIGTERM to a process prepared for it."""
+        """Take back a worker's tasks that wait, or send SIGTERM to a process prepared for it."""
         child = self._child
         if child is None:
             return
         if child.tasks:
-            child.recall()
+            child.drain()
         elif child.pid is not None and is_expected(child.pid, signal.SIGTERM):
             child.signal(signal.SIGTERM)
 

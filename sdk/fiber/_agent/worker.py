@@ -73,7 +73,11 @@ def run(
 
 
 class BatchRunner:
-    """Runner of batches.  ``progress``: two shared words, batch and index of the running task."""
+    """Runner of batches.
+
+    ``progress``: three words that the agent shares.  Batch and index of the running task, and
+    whether the host is about to end, so that the tasks which have not begun are returned.
+    """
 
     def __init__(
         self,
@@ -260,6 +264,8 @@ class BatchRunner:
             elif batch.add(value):
                 value = None  # it may be large, and is pickled already
                 batch.flush()
+            if progress[2]:
+                batch.return_unstarted()
 
     def _run_singly(
         self, batch: BatchResults, function: _Function, head: work.Head, started: float
@@ -278,7 +284,8 @@ class BatchRunner:
                     raise
             else:
                 values.append(value)
-            if time.perf_counter() - started > SPLIT_AFTER and not len(values) % head.unit:
+            slow = time.perf_counter() - started > SPLIT_AFTER
+            if (slow and not len(values) % head.unit) or progress[2]:
                 batch.encode_new()
                 batch.return_unstarted()
         batch.encode_new()
@@ -299,7 +306,8 @@ class BatchRunner:
             batch.encode_new()
             if not more:
                 return
-            if time.perf_counter() - started > SPLIT_AFTER and len(values) % unit == 0:
+            slow = time.perf_counter() - started > SPLIT_AFTER
+            if (slow and len(values) % unit == 0) or self._progress[2]:
                 batch.return_unstarted()
 
     def _extend(self, batch: BatchResults, results: Iterator[Any], size: int) -> bool:
