@@ -101,6 +101,8 @@ class Main:
         grace = _seconds(_TERMINATION_GRACE)
         self._grace = _DEFAULT_GRACE if grace is None else grace
         self._cleaning_up = min(_CLEANING_UP, self._grace / 4)
+        self._drained_at: float | None = None
+        """Time of the first SIGTERM, from which the grace counts."""
         self._linked = os.environ.pop(_LINKED, "")
         self._parent = _pid(_PARENT)
         if self._parent is not None:
@@ -222,8 +224,14 @@ class Main:
                 self._environment[_WAITS_UNTIL] = str(time.monotonic() + grace)
         elif lost:
             self._status = 1
-        linger = self._cleaning_up if self._terminating else 1.0
-        self._link.close(reason, linger=linger, then=self._loop.stop)
+        self._link.close(reason, linger=self._linger(), then=self._loop.stop)
+
+    def _linger(self) -> float:
+        """Return for how many seconds the link may go on sending results: what the grace leaves."""
+        if not self._terminating:
+            return 1.0
+        began = time.monotonic() if self._drained_at is None else self._drained_at
+        return max(began + self._grace - time.monotonic(), self._cleaning_up)
 
     def _is_terminating(self) -> bool:
         """Return whether SIGTERM came, also if another thread took it and no handler ran yet."""
@@ -249,6 +257,8 @@ class Main:
 
     def _on_sigterm(self, *_: object) -> None:
         self._terminating = True
+        if self._drained_at is None:
+            self._drained_at = time.monotonic()
         self._loop.call_soon(self._drain)
 
     def _drain(self) -> None:
