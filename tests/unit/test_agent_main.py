@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
+
 import pytest
 
 from fiber._agent import main
@@ -42,3 +45,25 @@ def test_the_time_to_clean_up_remains_at_the_end_of_the_grace(
 
 def test_an_agent_that_is_not_drained_ends_soon(agent: Main) -> None:
     assert agent._linger() == 1.0
+
+
+@pytest.mark.parametrize("planted", ["pipe", "link"])
+def test_what_a_task_puts_in_place_of_the_mark_does_not_hold_up_the_agent(
+    agent: Main, tmp_path: Path, planted: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    mark = tmp_path / "linked"
+    if planted == "pipe":
+        os.mkfifo(mark)
+    else:
+        mark.symlink_to(tmp_path / "elsewhere")
+    agent._linked, agent._name = str(mark), "es-1"
+    agent._tell_of_link()
+    assert "its pod does not get Ready" in capfd.readouterr().err
+    assert not (tmp_path / "elsewhere").exists()
+
+
+def test_the_mark_is_there_once_the_agent_is_linked(agent: Main, tmp_path: Path) -> None:
+    agent._linked = str(tmp_path / "linked")
+    agent._tell_of_link()
+    agent._tell_of_link()
+    assert (tmp_path / "linked").exists()

@@ -134,6 +134,13 @@ def test_a_healthy_pod_has_no_reason(document: dict[str, Any]) -> None:
     assert pod_end(document) is None
 
 
+def test_an_eviction_for_the_pods_own_excess_is_no_disruption() -> None:
+    message = "Pod ephemeral local storage usage exceeds the total limit of containers 1Gi. "
+    ended = pod_end(pod(reason="Evicted", message=message))
+    assert ended is not None
+    assert (ended.reason, ended.disrupted) == (f"Evicted: {message.rstrip('. ')}", False)
+
+
 def test_a_disruption_that_did_not_come_is_none() -> None:
     document = pod(phase="Running", disruption=("PreemptionByScheduler", "preempting"))
     document["status"]["conditions"][-1]["status"] = "False"

@@ -50,6 +50,16 @@ def test_an_agent_speaks_for_no_child_of_another(message: messages.LinkMessage) 
     assert vars(own) == unheard
 
 
+def test_a_child_without_memory_on_a_pod_that_is_deleted_ended_by_its_own_doing() -> None:
+    agent, (observer,) = agent_with_children("far", 1)
+    agent.ending, agent.disrupted = "Deleted: somebody deleted the pod", True
+    said = messages.Exited(1, 0, -signal.SIGKILL, "OOMKilled: the limit is 1 GiB", (), None, ())
+    agent.on_frame(bytearray(said.encode()))
+    report = observer.report
+    assert report is not None
+    assert (report.reason, report.disrupted) == ("OOMKilled: the limit is 1 GiB", False)
+
+
 def test_the_end_of_a_child_names_the_host_of_its_link() -> None:
     agent, (observer,) = agent_with_children("far", 1)
     agent.pod, agent.node = "es-1", "node-2"

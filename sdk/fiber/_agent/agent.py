@@ -24,7 +24,7 @@ from typing import Any
 
 from fiber._agent import zygote
 from fiber._agent.child import StartRequest, lineage
-from fiber._agent.interface import Cause, ChildObserver, ChildSpec, ExitReport
+from fiber._agent.interface import OUT_OF_MEMORY, Cause, ChildObserver, ChildSpec, ExitReport
 from fiber._agent.last_words import MemoryLimit, ProgressTable, describe
 from fiber._agent.preload import Imports
 from fiber._agent.zygote_link import ZygoteLink
@@ -246,7 +246,7 @@ class Agent:
     def describe_end(self, exitcode: int) -> str:
         """Return an exit code in words, and whether the memory limit caused a SIGKILL."""
         if exitcode == -signal.SIGKILL and self.memory_limit.was_exceeded():
-            return f"OOMKilled: {self.memory_limit.describe()}"
+            return f"{OUT_OF_MEMORY}: {self.memory_limit.describe()}"
         return describe(exitcode)
 
     def _release(self, child: LocalChild) -> tuple[tuple[int, ...], tuple[int, int] | None]:

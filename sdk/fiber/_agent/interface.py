@@ -36,6 +36,10 @@ class Cause(IntEnum):
     """The host, which is about to end.  It killed the child or never started it."""
 
 
+OUT_OF_MEMORY = "OOMKilled"
+"""First word of the reason of a child that exceeded the memory limit of its host."""
+
+
 class ExitReport(NamedTuple):
     """Report of how a child ended."""
 

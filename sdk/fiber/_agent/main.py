@@ -196,8 +196,9 @@ class Main:
 
     def _tell_of_link(self) -> None:
         try:
-            with open(self._linked, "ab"):
-                pass
+            # Tasks may write there.  A named pipe in its place must not hold up the agent.
+            flags = os.O_WRONLY | os.O_CREAT | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC
+            os.close(os.open(self._linked, flags, 0o666))
         except OSError as error:
             self._complain(f"it is linked, and its pod does not get Ready, because of {error}")
 

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import lru_cache, partial
 from typing import Protocol
 
-from fiber._agent.interface import Cause, ChildObserver, ChildSpec, ExitReport
+from fiber._agent.interface import OUT_OF_MEMORY, Cause, ChildObserver, ChildSpec, ExitReport
 from fiber._hub.hub import Hub
 from fiber._logs import OutputWriter
 from fiber._transport.link import Link
@@ -177,6 +177,8 @@ class RemoteAgent:
         if report.cause == Cause.DRAINED:
             why = self.ending or self.leaving
             return report._replace(disrupted=True, reason=why or report.reason)
+        if report.reason.startswith(OUT_OF_MEMORY):
+            return report  # by its own doing, also if its pod ends meanwhile
         if self.ending and report.exitcode < 0:  # together with its pod
             killed = report.exitcode in (-signal.SIGKILL, -signal.SIGTERM)
             return report._replace(reason=self.ending, disrupted=self.disrupted and killed)

@@ -245,7 +245,7 @@ def pod_end(pod: Mapping[str, Any], container: str = names.WORKER_CONTAINER) -> 
     """
     status = pod.get("status") or {}
     worker = _ended(status, container)
-    own = _out_of_memory(pod, worker, container)
+    own = _out_of_memory(pod, worker, container) or _own_excess(status)
     disruption = None if own else _disruption(pod) or _deletion(pod) or _lost_container(worker)
     reason = own or disruption or _own_end(status, worker)
     if reason is None:
@@ -275,6 +275,24 @@ def _out_of_memory(pod: Mapping[str, Any], worker: Mapping[str, Any], container:
             limit = ((found.get("resources") or {}).get("limits") or {}).get("memory")
     # Without a limit, the node had no memory left.
     return f"OOMKilled: its memory limit is {limit}" if limit else "OOMKilled: it has no limit"
+
+
+def _own_excess(status: Mapping[str, Any]) -> str | None:
+    """Return the reason of an eviction for what the pod itself did: the next pod would do it too.
+
+    Such an eviction has no condition DisruptionTarget.
+    """
+    message = str(status.get("message") or "")
+    conditions = status.get("conditions") or ()
+    if (
+        status.get("reason") != "Evicted"
+        or not ("exceeds the" in message or "exceeded its" in message)
+        or any(
+            c.get("type") == "DisruptionTarget" and c.get("status") == "True" for c in conditions
+        )
+    ):
+        return None
+    return _sentence("Evicted", message)
 
 
 def _disruption(pod: Mapping[str, Any]) -> str | None:
