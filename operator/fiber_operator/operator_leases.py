@@ -34,6 +34,9 @@ HELD_SHARE = 2 / 3
 """Share of the duration for which a renewal lets the holder act."""
 WRITTEN_SHARE = 9 / 10
 """Share of the duration after which its last write has ended.  The rest is for differing clocks."""
+LONGEST_PATIENCE = 10
+"""Times this operator's own duration that a Lease lasts which is not renewed, whatever it says: an
+account that may write it must not stop the operator for years."""
 RENEW_SHARE = 1 / 3
 RETRY_SHARE = 1 / 8
 
@@ -172,6 +175,7 @@ class LeaderElector:
         patience = spec.get("leaseDurationSeconds")
         if not isinstance(patience, int) or patience <= 0:
             patience = int(self._seconds)
+        patience = min(patience, LONGEST_PATIENCE * self._seconds)
         if now - self._seen_at >= patience:
             return True
         self._lose(f"{holder} holds it")

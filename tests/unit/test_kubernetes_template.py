@@ -178,7 +178,12 @@ class TestInAPod:
         assert reference["containerName"] == "worker"
 
     @pytest.mark.parametrize(
-        "name", ["WANDB_API_KEY", "GITHUB_TOKEN", "DB_PASSWORD", "AWS_SECRET_ACCESS_KEY", "secret"]
+        "name",
+        [
+            *("WANDB_API_KEY", "GITHUB_TOKEN", "DB_PASSWORD", "AWS_SECRET_ACCESS_KEY", "secret"),
+            *("PGPASSWORD", "DB_PASS", "MYSQL_PWD", "DATABASE_URL", "REDIS_URL", "GITHUB_PAT"),
+            *("SSH_KEY", "ENCRYPTION_KEY", "DOCKER_AUTH_CONFIG"),
+        ],
     )
     def test_a_secret_in_its_manifest_stays_behind(self, name: str) -> None:
         pod = copy.deepcopy(POD)
@@ -187,7 +192,9 @@ class TestInAPod:
         assert worker_of(like(pod=pod))["env"] == [{"name": "SEED", "value": "1"}]
         assert secrets_left_out(pod, "main") == [name]
 
-    @pytest.mark.parametrize("name", ["TOKENIZERS_PARALLELISM", "MAX_TOKENS", "MONKEY", "KEYBOARD"])
+    @pytest.mark.parametrize(
+        "name", ["TOKENIZERS_PARALLELISM", "MAX_TOKENS", "MONKEY", "KEYBOARD", "PWD"]
+    )
     def test_a_name_that_only_resembles_a_secrets_goes_along(self, name: str) -> None:
         pod = copy.deepcopy(POD)
         pod["spec"]["containers"][1]["env"] = variables = [{"name": name, "value": "1"}]

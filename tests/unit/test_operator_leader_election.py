@@ -13,6 +13,7 @@ from fakes import virtual_time
 from fakes.kubernetes_api import Fault, KubernetesApi
 from fakes.store import Body, Store
 from fakes.world import configuration
+from fiber_operator import operator_leases
 from fiber_operator.cluster import PODS, Cluster
 from fiber_operator.operator_leases import LeaderElector, NotLeader
 from fiber_operator.responses import Unavailable
@@ -278,6 +279,15 @@ def test_a_holder_that_says_no_duration_is_given_ours(duration: object) -> None:
         assert SECONDS <= await until(lambda: elector.is_leader) <= SECONDS + 3
 
     test()
+
+
+@played
+async def test_a_holder_that_asks_for_years_is_waited_for_some_minutes(found: Operators) -> None:
+    spec = {"holderIdentity": "other", "leaseDurationSeconds": 2**31 - 1}
+    found.store.create("leases", NAMESPACE, {"metadata": {"name": NAME}, "spec": spec})
+    elector = found.start("a")
+    longest = operator_leases.LONGEST_PATIENCE * SECONDS
+    assert longest <= await until(lambda: elector.is_leader) <= longest + 3
 
 
 @played

@@ -193,7 +193,9 @@ def secrets_left_out(pod: Mapping[str, Any], container: str) -> list[str]:
 
 
 _SECRET = re.compile(
-    r"(^|_)(SECRET|TOKEN|PASSWORD|PASSWD|PASSPHRASE|CREDENTIALS?|(API|ACCESS|PRIVATE)_?KEY)(_|$)",
+    r"(^|_)(SECRET|TOKEN|PASSWORD|PASSWD|PASSPHRASE|PASS|PAT|CREDENTIALS?|AUTH|DSN"
+    r"|(API|ACCESS|PRIVATE|SSH|ENCRYPTION|SIGNING)_?KEY|(DATABASE|DB|REDIS|MONGO|AMQP)_UR[IL])(_|$)"
+    r"|^PGPASSWORD$|_PWD$",
     re.IGNORECASE,
 )
 
