@@ -287,7 +287,7 @@ async def test_a_holder_that_asks_for_years_is_waited_for_some_minutes(found: Op
     found.store.create("leases", NAMESPACE, {"metadata": {"name": NAME}, "spec": spec})
     elector = found.start("a")
     longest = operator_leases.LONGEST_PATIENCE * SECONDS
-    assert longest <= await until(lambda: elector.is_leader) <= longest + 3
+    assert longest <= await until(lambda: elector.is_leader, longest + 3)
 
 
 @played
