@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 import fiber
+from faults.runtime import running
 from fiber import managers
 
 
@@ -59,3 +60,17 @@ def test_pipes_and_queues_have_no_name() -> None:
             inode = os.readlink(f"/proc/self/fd/{end.fileno()}").strip("socket:[]")
             lines = [line.split() for line in Path("/proc/net/unix").read_text().splitlines()]
             assert [line[7:] for line in lines if line[6] == inode] == [[]]
+
+
+def renice_its_agent(by: int) -> tuple[int, int]:
+    zygote = Path(f"/proc/{os.getppid()}/stat").read_text()
+    agent = int(zygote.rpartition(")")[2].split()[1])
+    before = os.getpriority(os.PRIO_PROCESS, agent)
+    os.setpriority(os.PRIO_PROCESS, agent, before + by)
+    return before, os.getpriority(os.PRIO_PROCESS, agent)
+
+
+def test_a_task_changes_the_priority_of_its_agent() -> None:
+    with running(backend="loopback"), fiber.Pool(1) as pool:
+        before, after = pool.apply(renice_its_agent, (1,))
+    assert after == before + 1

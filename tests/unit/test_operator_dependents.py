@@ -7,8 +7,9 @@ from typing import Any
 
 import pytest
 
+from fakes import virtual_time
 from fakes.kubernetes_api import Fault
-from fakes.world import NAMESPACE, World, played
+from fakes.world import NAMESPACE, World, a_world, played
 from unit.operator_objects import MASTER
 
 LABELS = {"fiber.dev/pool": "es", "fiber.dev/pool-uid": "1"}
@@ -45,6 +46,27 @@ def test_a_secret_of_another_pool_is_refused(by: str) -> None:
         assert "Leave credentialsSecretName out" in message
 
     test()
+
+
+def test_a_secret_that_names_the_pool_as_its_owner_is_taken() -> None:
+    """The operator may have made it and ended before it wrote the status."""
+
+    async def main() -> None:
+        async with a_world() as world:
+            world.make_pool("another")
+            await world.ready(0, "another")
+            another = world.store.get("secrets", NAMESPACE, "another-fiber-key")
+            await world.stop()
+            pool = world.make_pool(replicas=1)
+            owner = {"kind": "FiberPool", "uid": pool["metadata"]["uid"], "controller": True}
+            metadata = {"name": "es-fiber-key", "ownerReferences": [owner]}
+            planted = {**another, "metadata": metadata}
+            world.store.create("secrets", NAMESPACE, planted)
+            world.start()
+            await world.ready(1)
+            assert world.store.get("secrets", NAMESPACE, "es-fiber-key")["data"] == planted["data"]
+
+    virtual_time.run(main())
 
 
 @played
