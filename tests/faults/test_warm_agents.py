@@ -99,8 +99,14 @@ class Pool:
         finally:
             os.close(inherited)
 
-    def master(self, *grace: str) -> Program:
-        master = self._launch(MASTER, str(self._path), self.address, *grace)
+    def stranger(self) -> Program:
+        """Start the master of another pool at the same address."""
+        path = self._path.with_name("others")
+        path.write_bytes(pickle.dumps(make_credentials("cd" * 32)))
+        return self.master(path=path)
+
+    def master(self, *grace: str, path: Path | None = None) -> Program:
+        master = self._launch(MASTER, str(path or self._path), self.address, *grace)
         assert master.line() == "listens"
         return master
 
@@ -220,6 +226,17 @@ def test_it_finds_the_next_master_when_the_last_was_killed(pool: Pool) -> None:
         master.kill()
     assert pool.master().line() == "joined warm-0"
     assert re.fullmatch(r"(fiber agent warm-0: lost the master: .*\n){2}", agent.stderr)
+
+
+def test_a_stranger_at_the_address_of_a_lost_master_is_not_the_end(pool: Pool) -> None:
+    agent = pool.agent(grace=60)
+    master = pool.master()
+    assert master.line() == "joined warm-0"
+    master.kill()
+    stranger = pool.stranger()
+    wait_for(lambda: "do not trust each other" in agent.stderr)
+    stranger.kill()
+    assert pool.master().line() == "joined warm-0"
 
 
 def test_it_ends_when_no_master_comes_after_a_lost_one(pool: Pool) -> None:

@@ -204,7 +204,9 @@ class Main:
 
     def _failed(self, error: Exception) -> None:
         self._complain(error)
-        if self._lost_grace is None or not isinstance(error, LinkError):
+        # After a lost master, another program may have its address until the next master comes.
+        stranger = self._waits_until is not None and isinstance(error, AuthenticationError)
+        if self._lost_grace is None or not (stranger or isinstance(error, LinkError)):
             self._status = 1
         elif self._waits_until is None or self._timeout():
             # The master answered and refused: it is ending, or took the name for another agent's.
