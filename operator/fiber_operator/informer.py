@@ -152,6 +152,7 @@ class _Reflector:
         self._settled.clear()
         if self._watching is not None:
             self._watching.reschedule(_now())
+            self._watching = None  # it cannot be rescheduled again once it has expired
 
     # What the operator does itself
 

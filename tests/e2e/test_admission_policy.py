@@ -48,6 +48,32 @@ ASKED = {
         of_container(securityContext={"capabilities": {"add": ["NET_ADMIN"]}}),
         "more capabilities",
     ),
+    "a driver of the node": (
+        of_pod(volumes=[{"name": "driver", "flexVolume": {"driver": "example.com/any"}}]),
+        "flexVolume",
+    ),
+    "a process of the node": (
+        of_pod(securityContext={"windowsOptions": {"hostProcess": True}}),
+        "hostProcess",
+    ),
+    "the whole of /proc": (of_container(securityContext={"procMount": "Unmasked"}), "procMount"),
+    "no seccomp": (
+        of_pod(securityContext={"seccompProfile": {"type": "Unconfined"}}),
+        "Unconfined",
+    ),
+    "no seccomp in the container": (
+        of_container(securityContext={"seccompProfile": {"type": "Unconfined"}}),
+        "Unconfined",
+    ),
+    "kernel parameters": (
+        of_pod(securityContext={"sysctls": [{"name": "kernel.msgmax", "value": "1"}]}),
+        "sysctls",
+    ),
+    "a node by its name": (of_pod(nodeName="node-1"), "nodeName"),
+    "a priority class of the system": (
+        of_pod(priorityClassName="system-node-critical"),
+        "priority class of the system",
+    ),
     "a port of the node": (of_container(ports=[PORT]), "hostPort"),
     "another account": (of_pod(serviceAccountName="master"), "ServiceAccount"),
     "another account, by its old name": (of_pod(serviceAccount="master"), "ServiceAccount"),
