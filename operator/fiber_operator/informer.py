@@ -183,7 +183,7 @@ class _Reflector:
                 if self._failures or isinstance(error, Refused):
                     self._failure, self._version = error, ""
                     self._settled.set()
-                self._answered(self._what("watch"), error)
+                    self._answered(self._what("watch"), error)
                 pause = PAUSES[min(self._failures, len(PAUSES) - 1)]
                 self._failures += 1
                 await asyncio.sleep(pause)

@@ -258,6 +258,16 @@ async def test_a_refresh_lists_before_pods_are_returned(site: Site) -> None:
 
 
 @played()
+async def test_two_refreshes_are_as_good_as_one(site: Site) -> None:
+    site.make("a")
+    await site.names()
+    await asyncio.sleep(1)  # it watches
+    site.informer.refresh()
+    site.informer.refresh()
+    assert await site.names() == ["a"]
+
+
+@played()
 async def test_a_refresh_in_the_middle_of_a_list_lists_again(site: Site) -> None:
     def refresh(call: Call) -> None:
         if call.verb == "list":
@@ -363,6 +373,7 @@ async def test_one_failure_of_a_watch_does_not_hide_the_pods(site: Site) -> None
     site.api.drop_watches()
     for _ in range(10):
         assert await site.names() == ["a"]
+        assert not site.answers.get("watch pods"), "one failure is not reported"
         await asyncio.sleep(0.1)
 
 
