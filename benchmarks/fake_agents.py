@@ -21,7 +21,7 @@ from fiber._wire.memory_files import BytesLike
 from fiber._wire.packet import Message
 
 _READY = pickle.dumps((work.READY,))
-_BOARD = 16
+_BOARD = 24
 _BIRTH = 0.01
 """Seconds until a child is ready, about those of a real one: no process is ready before the call
 that starts it has returned, and the master need not be quick about one that is."""
