@@ -167,6 +167,17 @@ def test_modules_that_a_task_wrote_do_not_run_for_the_next_master(
     assert [place for place in places if Path(f"{place}.ran").exists()] == []
 
 
+@pytest.mark.parametrize("settings", ["[tool.fiber", "[tool.fiber]\nunknown = 1"])
+def test_settings_that_a_task_wrote_do_not_reach_the_next_master(pool: Pool, settings: str) -> None:
+    agent = pool.agent(30)
+    master = pool.master()
+    assert master.line() == "joined warm-0"
+    (agent.folder / "pyproject.toml").write_text(settings)
+    master.signal(signal.SIGTERM)
+    assert master.wait() == 0
+    assert pool.master().line() == "joined warm-0"
+
+
 def test_children_of_the_next_master_have_the_first_ones_flags() -> None:
     program = """
 import subprocess, sys

@@ -10,6 +10,7 @@ import ctypes
 import importlib.util
 import math
 import os
+import pickle
 import signal
 import socket
 import sys
@@ -288,15 +289,17 @@ class Main:
 
 
 def _restart_command() -> list[str]:
-    """Return the command of an agent that cannot import modules that a task has written.
+    """Return the command of an agent that uses no module or setting that a task has written.
 
     The environment is for its children.  The agent's own interpreter ignores it.
     """
     keep_search_path()
     flags = zygote_process.flags()
+    settings = pickle.dumps(config.current())
     statement = (
         f"import sys; sys.path[:] = {sys.path!r}; from fiber._agent import zygote_process; "
         f"zygote_process.interpreter_flags = {flags!r}; "
+        f"from fiber import _config_sources; _config_sources.keep({settings!r}); "
         "import runpy; runpy.run_module('fiber.agent', run_name='__main__')"
     )
     return [sys.executable, *flags, "-I", "-B", "-c", statement]
