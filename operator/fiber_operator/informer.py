@@ -79,7 +79,7 @@ class PodInformer:
 
     async def pods(self, key: Key, uid: str) -> list[PodView]:
         """Return the pods of the pool with that uid; raise ApiError if they are not known."""
-        return await self._of(key.namespace).pods(uid)
+        return await self._of(key.namespace).pods(key.namespace, uid)
 
     def created(self, namespace: str, document: Body) -> None:
         """Expect a pod that this operator has created."""
@@ -97,8 +97,8 @@ class _Known(NamedTuple):
     """Pod in the cache."""
 
     key: Key
-    pool: str
-    """The uid of the pool."""
+    pool: tuple[str, str]
+    """The namespace of the pod, and the uid of the pool."""
     view: PodView
 
 
@@ -118,8 +118,9 @@ class _Reflector:
         self._answered = answered
         self._pods: dict[str, _Known] = {}
         """Pods by uid."""
-        self._pools: dict[str, dict[str, PodView]] = {}
-        """The same pods: uid of the pool -> uid of the pod -> view."""
+        self._pools: dict[tuple[str, str], dict[str, PodView]] = {}
+        """The same pods: namespace, and uid of the pool in the label -> uid of the pod -> view.  The label
+        alone does not do: a pod of another namespace may have it."""
         self._expected: dict[str, float] = {}
         """Pods that were created and that the watch has not shown: uid -> time of the event loop.
         The oldest is the first."""
@@ -136,7 +137,7 @@ class _Reflector:
         """Attempts that failed since the last one that succeeded."""
         self._watching: asyncio.Timeout | None = None
 
-    async def pods(self, uid: str) -> list[PodView]:
+    async def pods(self, namespace: str, uid: str) -> list[PodView]:
         try:
             async with asyncio.timeout(SYNC_TIMEOUT):
                 await self._settled.wait()
@@ -144,7 +145,7 @@ class _Reflector:
             raise Unavailable("the pods were not listed in time", what="list pods") from None
         if self._failure is not None:
             raise self._failure.again()
-        return list(self._pools.get(uid, {}).values())
+        return list(self._pools.get((namespace, uid), {}).values())
 
     def refresh(self) -> None:
         self._version = ""
@@ -268,7 +269,8 @@ class _Reflector:
         if uid in self._ending:
             view = _as_ending(view)
         key = Key(text(metadata.get("namespace")), text(labels.get(names.LABEL_POOL)))
-        known = _Known(key, text(labels.get(names.LABEL_POOL_UID)), view)
+        pool = key.namespace, text(labels.get(names.LABEL_POOL_UID))
+        known = _Known(key, pool, view)
         if before is not None and before.pool != known.pool:
             self._drop(uid)
         self._put(uid, known)

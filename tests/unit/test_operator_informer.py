@@ -155,6 +155,14 @@ async def test_pods_of_other_pools_and_of_no_pool_are_not_returned(site: Site) -
     assert await site.views(pool="another") == {}
 
 
+@played()
+async def test_pods_of_another_namespace_are_not_the_pools(site: Site) -> None:
+    site.make("ours")
+    site.make("theirs", "another")
+    await site.until_there("ours")
+    assert list(await site.views("another")) == ["theirs"]
+
+
 @played("one", "two")
 async def test_only_the_given_namespaces_are_watched(site: Site) -> None:
     for namespace in ("one", "two", "three"):
