@@ -119,8 +119,8 @@ class _Reflector:
         self._pods: dict[str, _Known] = {}
         """Pods by uid."""
         self._pools: dict[tuple[str, str], dict[str, PodView]] = {}
-        """The same pods: namespace, and uid of the pool in the label -> uid of the pod -> view.  The label
-        alone does not do: a pod of another namespace may have it."""
+        """The same pods: namespace and uid of the pool -> uid of the pod -> view.  The uid alone
+        does not do: a pod of another namespace may have the label."""
         self._expected: dict[str, float] = {}
         """Pods that were created and that the watch has not shown: uid -> time of the event loop.
         The oldest is the first."""
