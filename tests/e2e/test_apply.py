@@ -125,7 +125,7 @@ def test_a_released_name_that_is_no_worker_is_reported(pool: Pool, lone_agent: B
     pool.apply(lone_agent)
     pool.attach(master=SOMEWHERE, replicas=1, scaleDown={"release": ["kube-dns"]})
     problem = pool.has_problem("InvalidRelease", severity="Warning")
-    assert says(problem["message"], "spec.scaleDown.release", "kube-dns", "Nothing is deleted")
+    assert says(problem["message"], "spec.scaleDown.release", "kube-dns", "No pod is deleted")
     pool.ready(1)
 
 

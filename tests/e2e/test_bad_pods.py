@@ -61,7 +61,7 @@ def is_told_soon(pool: Pool, reported: Callable[[Body], bool], reason: str, **fi
 def test_an_image_that_cannot_be_pulled(pools: Pools) -> None:
     pool = pools["bad-image"]
     problem = pool.has_problem("ImagePullError", severity="Error", seconds=60)
-    words = (problem["pod"], "registry.invalid/none:1", "imagePullSecrets", "correct")
+    words = (problem["pod"], "registry.invalid/none:1", "Correct", "imagePullSecrets")
     assert says(problem["message"], *words)
     assert not problem.get("terminal")
     assert pool.status["phase"] == "Degraded"
@@ -114,7 +114,7 @@ def test_a_secret_that_is_missing(pools: Pools) -> None:
     pool = pools["no-secret"]
     problem = pool.has_problem("CreateContainerConfigError", severity="Error")
     assert says(
-        problem["message"], problem["pod"], 'secret "absent" not found', "Create the Secret"
+        problem["message"], problem["pod"], 'secret "absent" not found', "Create the missing Secret"
     )
     assert not problem.get("terminal")
     is_told_soon(pool, waits_for("CreateContainerConfigError"), "CreateContainerConfigError")
@@ -164,8 +164,8 @@ def test_a_worker_that_fails_is_tried_again_and_then_no_more(pools: Pools) -> No
         "in a row",
         "failurePolicy.backoffLimit",
         "2",
-        "no more",
-        "until the spec changes",
+        "No workers are created until template",
+        "change in the spec",
     )
     assert says(last["message"], *words, "model.pt: no such file")
     assert pool.status["phase"] == "Failed"
