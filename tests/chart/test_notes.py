@@ -48,10 +48,13 @@ def test_the_notes_name_the_watched_namespaces(helm: Helm) -> None:
     assert "watches the namespaces team-a, team-b, and no other." in helm.notes(TWO)
 
 
-def test_it_says_whose_rights_are_within_reach(helm: Helm) -> None:
-    words = f"Accounts that may make FiberPools in {NAMESPACE} may run pods as any ServiceAccount"
-    assert words in helm.notes({"scope": "namespaced"})
-    assert words not in helm.notes(TWO)
+def test_it_warns_where_users_of_pools_may_reach_the_operator(helm: Helm) -> None:
+    warning = "WARNING: the operator serves the namespace that it runs in."
+    advice = f"Give no account the role fiber-user in {NAMESPACE}"
+    own, everywhere, apart = helm.notes({"scope": "namespaced"}), helm.notes(), helm.notes(TWO)
+    assert (warning in own, advice in own) == (True, False)
+    assert (warning in everywhere, advice in everywhere) == (False, True)
+    assert (warning in apart, advice in apart) == (False, False)
 
 
 def test_the_notes_name_the_omitted_parts(helm: Helm) -> None:

@@ -291,6 +291,19 @@ async def test_a_holder_that_asks_for_years_is_waited_for_some_minutes(found: Op
 
 
 @played
+async def test_repeated_writes_of_the_lease_stop_the_operator_for_as_long(found: Operators) -> None:
+    """A known limit: such a writer looks like another process of the release."""
+    elector = found.start("a")
+    await until(lambda: elector.is_leader)
+    for turn in range(100):
+        forged = found.lease() | {"holderIdentity": "writer", "leaseTransitions": turn}
+        found.store.merge("leases", NAMESPACE, NAME, {"spec": forged})
+        await asyncio.sleep(SECONDS / 2)
+        assert not elector.is_leader
+    assert await until(lambda: elector.is_leader) <= SECONDS + 3
+
+
+@played
 async def test_the_clocks_of_others_do_not_count(found: Operators) -> None:
     """A renewTime that is an hour old, or in the future, says nothing."""
     for stamp in ("2020-01-01T00:00:00.000000Z", "2099-01-01T00:00:00.000000Z"):
