@@ -1,22 +1,20 @@
-"""Versions, programs and packages of the test cluster: known, built once, asked for plainly."""
+"""Smoke tests: the test cluster's programs and packages are built and installed once."""
 
 from __future__ import annotations
 
 import os
-import stat
-import threading
 from pathlib import Path
 
 import pytest
 
-from cluster import build, packages, places
-from cluster.shell import ClusterError, locked
+from cluster import ability, build, images, packages, places, preparation
+from cluster.shell import ClusterError
 
-# A go that builds the programs that the module names as empty files, and counts its calls.
+# A go that builds one program as an empty file, and counts its calls.
 GO = """#!/bin/sh
 echo "$*" >> "$CALLS"
 while [ "$1" != -o ]; do shift; done
-touch "$2helm"
+touch "$2kubernetes"
 """
 
 
@@ -25,12 +23,8 @@ def _own_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
 
-@pytest.fixture
-def go_calls(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    return install_go(monkeypatch, tmp_path, GO)
-
-
 def install_go(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, script: str) -> Path:
+    """Put this go first on the PATH; return the file with its calls."""
     go, calls = tmp_path / "bin" / "go", tmp_path / "calls"
     go.parent.mkdir()
     go.write_text(script)
@@ -41,36 +35,28 @@ def install_go(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, script: str) -> 
     return calls
 
 
-@pytest.mark.parametrize("folder", places.SOURCES)
-def test_versions_come_from_the_modules(folder: str) -> None:
-    assert all(part.isdigit() for part in places.version(folder).split("."))
-    assert f"{folder}-{places.version(folder)}" in places.cache().name
-
-
-def test_programs_are_built_once(go_calls: Path) -> None:
-    build.build(["helm"])
-    build.build(["helm"])
-    assert len(go_calls.read_text().splitlines()) == 1
-    assert build.missing("helm") == []
-    assert build.missing("kwok") == ["kwok"]
-
-
-def test_two_simultaneous_builds_build_once(go_calls: Path) -> None:
-    threads = [threading.Thread(target=build.build, args=(["helm"],)) for _ in range(2)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert len(go_calls.read_text().splitlines()) == 1
-
-
-def test_a_failed_build_leaves_no_file_that_looks_built(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+def test_kubernetes_is_built_once_under_the_names_of_its_programs(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    calls = install_go(monkeypatch, tmp_path, GO)
+    for _ in range(2):
+        build.build(["kubernetes"])
+    assert len(calls.read_text().splitlines()) == 1
+    assert build.missing("kubernetes") == []
+    main = (places.HERE / "kubernetes" / "main.go").read_text(encoding="utf-8")
+    for name in places.SOURCES["kubernetes"].programs:
+        assert (places.programs() / name).resolve() == places.programs() / "kubernetes"
+        assert f'"{name}"' in main
+    said = capsys.readouterr().err
+    for part in (f"about {build.minutes()} minutes", "KUBECONFIG", "kind", "make test-fast"):
+        assert part in said
+
+
+def test_a_failed_build_leaves_no_program(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     install_go(monkeypatch, tmp_path, f"{GO}\necho 'no space left' >&2\nexit 1\n")
     with pytest.raises(ClusterError, match="no space left"):
-        build.build(["helm"])
-    assert build.missing("helm") == ["helm"]
+        build.build(["kubernetes"])
+    assert build.missing("kubernetes")
 
 
 def test_a_missing_go_is_an_error_with_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -79,28 +65,9 @@ def test_a_missing_go_is_an_error_with_the_remedy(monkeypatch: pytest.MonkeyPatc
         build.build(["helm"])
 
 
-def test_missing_packages_are_named_once() -> None:
-    wanted: dict[str | Path, str] = {
-        "no-such-program": "first",
-        "another-one": "first",
-        "sh": "second",
-    }
-    assert packages.missing(wanted) == ["first"]
-
-
-def test_complete_packages_cause_no_installation() -> None:
-    packages.need({"sh": "dash", Path("/bin/sh"): "dash"}, "test")
-
-
-def test_a_user_who_cannot_install_gets_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(os, "geteuid", lambda: 1000)
-    with pytest.raises(ClusterError, match=r"to fly, .* sudo apt-get install some-wings"):
-        packages.need({"no-such-program": "some-wings"}, "fly")
-
-
 @pytest.fixture
 def apt_get(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """Act as root, with an apt-get that makes an empty program of each package it installs."""
+    """Act as root, with an apt-get that makes an empty program of the last package."""
     folder = tmp_path / "apt"
     folder.mkdir()
     script = folder / "apt-get"
@@ -108,67 +75,59 @@ def apt_get(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
         '#!/bin/sh\n[ "$1" = install ] || exit 0\nfor name in "$@"; do :; done\n'
         f'touch "{folder}/$name"; chmod +x "{folder}/$name"\n'
     )
-    script.chmod(script.stat().st_mode | stat.S_IXUSR)
+    script.chmod(0o755)
     monkeypatch.setattr(os, "geteuid", lambda: 0)
     monkeypatch.setattr(places, "PACKAGES_LOCK", tmp_path / "lock")
     monkeypatch.setenv("PATH", f"{folder}:{os.environ['PATH']}")
     return folder
 
 
-def test_root_gets_them_installed(apt_get: Path) -> None:
-    packages.need({"wings-of-wax": "wings-of-wax"}, "fly")
-    assert (apt_get / "wings-of-wax").exists()
-
-
-@pytest.mark.usefixtures("apt_get")
-def test_a_package_that_does_not_help_is_named() -> None:
+def test_root_gets_missing_packages_installed(apt_get: Path) -> None:
+    packages.need({"sh": "dash", "wings": "wings"}, "fly")
+    assert [path.name for path in apt_get.iterdir() if path.name != "apt-get"] == ["wings"]
     with pytest.raises(ClusterError, match="installed feathers, but"):
-        packages.need({"wings": "feathers"}, "fly")
+        packages.need({"plume": "feathers"}, "fly")
 
 
-def test_a_lock_is_waited_for(tmp_path: Path) -> None:
-    order = []
-    inside, waiting = threading.Event(), threading.Event()
-
-    def second() -> None:
-        inside.wait()
-        waiting.set()
-        with locked(tmp_path / "lock", "works"):
-            order.append("second")
-
-    thread = threading.Thread(target=second)
-    thread.start()
-    with locked(tmp_path / "lock", "works"):
-        inside.set()
-        waiting.wait()
-        order.append("first")
-    thread.join()
-    assert order == ["first", "second"]
+def test_a_user_gets_the_command_that_installs_packages(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    with pytest.raises(ClusterError, match=r"to fly, .* sudo apt-get install some-wings"):
+        packages.need({"no-such-program": "some-wings"}, "fly")
 
 
-def test_the_wait_for_kubernetes_is_announced_with_its_length(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+WHOLE = ["helm", "packages", "kubernetes", "helm", "pause", "images"]
+
+
+@pytest.mark.parametrize(
+    ("kubeconfig", "obstacles", "network", "steps"),
+    [
+        ("", [], True, WHOLE),
+        ("/somewhere", [], True, ["helm"]),
+        ("", ["it takes root"], True, ["helm"]),
+        ("", [], False, ["helm"]),
+    ],
+    ids=["own-cluster", "given-cluster", "no-root", "no-network"],
+)
+def test_preparation_does_what_the_machine_can_and_never_fails(
+    monkeypatch: pytest.MonkeyPatch,
+    kubeconfig: str,
+    obstacles: list[str],
+    network: bool,
+    steps: list[str],
 ) -> None:
-    install_go(monkeypatch, tmp_path, GO.replace("helm", "kubernetes"))
-    build.build(["kubernetes"])
-    said = capsys.readouterr().err
-    assert "for a real cluster on this machine" in said
-    assert f"about {build.minutes()} minutes" in said
-    for way_out in ("KUBECONFIG", "kind", "make test-fast"):
-        assert way_out in said
+    done: list[str] = []
 
+    def need(*_: object) -> None:
+        if not network:
+            raise ClusterError("no network")
+        done.append("packages")
 
-def test_one_program_bears_the_names_of_all(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    install_go(monkeypatch, tmp_path, GO.replace("helm", "kubernetes"))
-    build.build(["kubernetes"])
-    assert build.missing("kubernetes") == []
-    for name in places.SOURCES["kubernetes"].programs:
-        assert (places.programs() / name).resolve() == places.programs() / "kubernetes"
-
-
-def test_the_program_knows_the_names_that_it_is_given() -> None:
-    main = (places.HERE / "kubernetes" / "main.go").read_text(encoding="utf-8")
-    for name in places.SOURCES["kubernetes"].programs:
-        assert f'"{name}"' in main
+    monkeypatch.setenv("KUBECONFIG", kubeconfig)
+    monkeypatch.setattr("shutil.which", lambda *_, **__: None)
+    monkeypatch.setattr(ability, "obstacles", lambda: obstacles)
+    monkeypatch.setattr(build, "build", done.extend)
+    monkeypatch.setattr(packages, "need", need)
+    monkeypatch.setattr(preparation, "pause_archive", lambda: done.append("pause"))
+    monkeypatch.setattr(images, "build_images", lambda: done.append("images"))
+    preparation.prepare()
+    assert done == steps

@@ -1,20 +1,51 @@
-"""The commands of the test cluster: what they print, and that the README knows them."""
+"""Smoke tests of the test cluster's commands, daemons and recognition of what is its own."""
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
+import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from cluster import commands, faults, images, lifecycle, network, places
-from cluster.daemons import Daemon
+from cluster import (
+    cgroups,
+    commands,
+    control_plane,
+    diagnosis,
+    faults,
+    images,
+    lifecycle,
+    memory,
+    network,
+    places,
+    remains,
+)
+from cluster.daemons import Daemon, all_daemons
 from cluster.lifecycle import Found
+from cluster.node import Node
+from cluster.pki import Pair, Pki
+from cluster.shell import ClusterError, wait_for
 from patience import PATIENCE
 
 TESTS = Path(__file__).resolve().parents[1]
+SLEEP = ("sleep", "300.0625")
+
+
+@pytest.fixture(autouse=True)
+def _own_folders(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
+    monkeypatch.setattr(places, "STATE", tmp_path / "state")
+    monkeypatch.setattr(places, "SOCKETS", tmp_path / "sockets")
+    yield
+    for daemon in all_daemons():
+        daemon.kill()
+
+
+# -- Commands
 
 
 def printed(capsys: pytest.CaptureFixture[str], *words: str) -> str:
@@ -32,72 +63,47 @@ def test_the_readme_has_every_command() -> None:
     assert sorted(names) == sorted(re.findall(r"`([a-z-]+)`", first_column))
 
 
-@pytest.fixture
-def shell_lines(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Return the exported lines if no image was brought."""
-    monkeypatch.setattr(lifecycle, "up", lambda _: None)
-    monkeypatch.setattr(images, "brought", lambda _: None)
-    return [f"export KUBECONFIG={places.KUBECONFIG}", f"export PATH={places.programs()}:$PATH"]
-
-
-def test_up_prints_lines_for_a_shell(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, shell_lines: list[str]
+@pytest.mark.parametrize(
+    ("words", "brought"),
+    [(["up", "--nodes", "3"], None), (["up", "--images"], ":1"), (["env"], ":1"), (["env"], None)],
+    ids=["up", "up-with-images", "env-with-images", "env"],
+)
+def test_up_and_env_print_lines_for_a_shell(
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    words: list[str],
+    brought: str | None,
 ) -> None:
     asked: list[object] = []
     monkeypatch.setattr(lifecycle, "up", asked.append)
-    assert printed(capsys, "up", "--nodes", "3").splitlines() == shell_lines
-    assert asked == [3]
-
-
-def test_up_with_images_exports_the_one_for_the_examples(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, shell_lines: list[str]
-) -> None:
-    references = {image.name: f"{image.name}:1" for image in images.IMAGES}
-    monkeypatch.setattr(images, "bring_images", lambda: references)
-    given = commands.parser().parse_args(["up", "--images"])
-    given.run(given)
-    said = capsys.readouterr()
-    assert said.out.splitlines() == [*shell_lines, "export FIBER_IMAGE=fiber-worker-rl:1"]
-    assert all(reference in said.err for reference in references.values())
-
-
-@pytest.mark.parametrize("command", ["up", "env"])
-def test_the_images_of_the_nodes_are_exported(
-    command: str,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    shell_lines: list[str],
-) -> None:
-    assert printed(capsys, command).splitlines() == shell_lines
-    monkeypatch.setattr(images, "brought", lambda image: f"{image.name}:1")
-    assert printed(capsys, command).splitlines() == [
-        *shell_lines,
-        "export FIBER_IMAGE=fiber-worker-rl:1",
-    ]
+    monkeypatch.setattr(images, "brought", lambda image: brought and f"{image.name}:1")
+    monkeypatch.setattr(
+        images, "bring_images", lambda: {image.name: f"{image.name}:1" for image in images.IMAGES}
+    )
+    lines = [f"export KUBECONFIG={places.KUBECONFIG}", f"export PATH={places.programs()}:$PATH"]
+    if brought:
+        lines.append("export FIBER_IMAGE=fiber-worker-rl:1")
+    assert printed(capsys, *words).splitlines() == lines
+    assert not asked if words == ["env"] else len(asked) == 1
 
 
 def test_status_names_the_parts_that_do_not_run(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(places, "STATE", tmp_path)
-    monkeypatch.setattr(places, "SOCKETS", tmp_path / "sockets")
     monkeypatch.setattr(network, "is_plugged_in", lambda _: False)
     assert printed(capsys, "status") == "no cluster is up\n"
     Found("/home/me/fiber", "/cache/kubernetes-1.34.4", 1).write()
     places.socket(1).parent.mkdir(parents=True)
-    (tmp_path / "daemons").mkdir()
-    for name in ("apiserver", "etcd"):
-        (tmp_path / "daemons" / f"{name}.json").write_text("[]")
-    monkeypatch.setattr(Daemon, "runs", lambda daemon: daemon.name == "etcd")
+    Daemon("etcd").start(*SLEEP)
+    (places.STATE / "daemons" / "apiserver.json").write_text("[]")
     out = printed(capsys, "status")
-    assert "kubernetes-1.34.4, 1 nodes, from /home/me/fiber" in out
-    assert "node-1 is cut off" in out
+    for line in ("1.34.4, 1 nodes, from /home/me/fiber", "node-1 is cut off", "etcd: runs"):
+        assert line in out
     assert "apiserver: does not run" in out
-    assert "etcd: runs" in out
 
 
 @pytest.mark.parametrize("command", ["cut", "restore", "stop", "start"])
-def test_faults_are_commands(
+def test_a_fault_is_a_command(
     command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[object] = []
@@ -106,7 +112,7 @@ def test_faults_are_commands(
     assert asked == ["node-1"]
 
 
-def test_an_error_is_a_sentence_and_not_a_traceback(tmp_path: Path) -> None:
+def test_an_error_is_a_sentence_and_not_a_traceback() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "cluster", "cut", "node-99"],
         cwd=TESTS,
@@ -117,3 +123,185 @@ def test_an_error_is_a_sentence_and_not_a_traceback(tmp_path: Path) -> None:
     assert done.returncode == 1
     assert done.stderr.startswith("cluster: there is no node node-99; there are: ")
     assert "Traceback" not in done.stderr
+    with pytest.raises(ClusterError, match="no daemon apisever"):
+        faults.stop("apisever")
+
+
+# -- Daemons
+
+
+def record_of(daemon: Daemon) -> Path:
+    return places.STATE / "daemons" / f"{daemon.name}.process"
+
+
+def pid_of(daemon: Daemon) -> int:
+    return int(record_of(daemon).read_text().split()[0])
+
+
+def test_a_daemon_is_started_once_found_again_and_killed() -> None:
+    daemon = Daemon("sleeper")
+    for _ in range(2):
+        daemon.start(*SLEEP)
+    pid = pid_of(daemon)
+    assert Daemon("sleeper").runs()
+    assert [found.name for found in all_daemons()] == ["sleeper"]
+    # No interrupt of the terminal reaches it.
+    assert os.getpgid(pid) == pid != os.getpgid(0)
+    daemon.kill()
+    assert not daemon.runs()
+    Daemon("sleeper").start_again()
+    assert daemon.runs()
+    assert pid_of(daemon) != pid
+
+
+def test_a_daemon_inherits_no_variable() -> None:
+    daemon = Daemon("printer")
+    daemon.start("env")
+    wait_for("its end", lambda: not daemon.runs(), seconds=PATIENCE)
+    said = daemon.log.read_text()
+    assert "XDG" not in said
+    assert "PYTEST_CURRENT_TEST" not in said
+    assert f"PATH={places.programs()}:" in said
+
+
+def test_a_process_that_has_the_number_of_a_daemon_is_not_killed() -> None:
+    daemon = Daemon("sleeper")
+    daemon.start(*SLEEP)
+    record, pid = record_of(daemon).read_text(), pid_of(daemon)
+    daemon.kill()
+    record_of(daemon).write_text(record.replace(str(pid), str(os.getpid()), 1))
+    assert not daemon.runs()
+    daemon.kill()  # and the test goes on
+
+
+def test_the_controllers_get_another_rate_and_their_first_one_again() -> None:
+    manager = Daemon("controller-manager")
+    command = ["sh", "-c", "exec sleep 300.0625", "sh", "--bind-address=127.0.0.1"]
+    manager.start(*command, "--kube-api-qps=1000", "--kube-api-burst=2000")
+    before, first = manager.command, pid_of(manager)
+    control_plane.limit_controllers(20)
+    assert manager.command == [*command, "--kube-api-qps=20", "--kube-api-burst=30"]
+    assert pid_of(manager) != first
+    control_plane.limit_controllers()
+    assert manager.command == before
+    assert manager.runs()
+
+
+@pytest.mark.parametrize(
+    ("script", "said"),
+    [
+        ("for i in $(seq 30); do echo line $i; done; exit 3", "exit status 3"),
+        ("exit 0", "log, is empty"),
+        ("kill -SEGV $$", "signal 11"),
+    ],
+)
+def test_the_diagnosis_says_how_a_daemon_ended_and_its_last_words(script: str, said: str) -> None:
+    daemon = Daemon("node-2-containerd")
+    daemon.start("sh", "-c", script)
+    wait_for("its end", lambda: not daemon.runs(), seconds=PATIENCE)
+    found = diagnosis.end_of([daemon]) or ""
+    assert found.startswith("node-2-containerd has ended: ")
+    assert said in found.replace(str(daemon.log), "log").replace(".log,", "log,")
+    assert found.count("\nline ") == (15 if "seq" in script else 0)
+    assert "`make cluster-down`" in found
+    daemon.start(*SLEEP)
+    assert (daemon.status(), diagnosis.end_of([daemon])) == (None, None)
+
+
+def test_the_diagnosis_names_killings_and_shortages(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    daemon = Daemon("node-2-containerd")
+    daemon.start("sh", "-c", "kill -KILL $$")
+    wait_for("its end", lambda: not daemon.runs(), seconds=PATIENCE)
+    counters = tmp_path / "vmstat"
+    counters.write_text(f"pgfault 1\noom_kill {memory.kills() + 2}\n")
+    monkeypatch.setattr(memory, "_COUNTERS", counters)
+    monkeypatch.setattr(memory, "available", lambda: 17 << 20)
+    monkeypatch.setattr(diagnosis, "_free_space", lambda: 17 << 20)
+    said = diagnosis.end_of([daemon]) or ""
+    assert "the kernel has killed 2 of the machine's processes for want of memory" in said
+    assert "17 MiB of memory left" in said
+    assert "17 MiB of disk left" in said
+    assert diagnosis.silence_of([], "refused\n").startswith("the last answer: refused\n")
+
+
+# -- What belongs to the cluster
+
+
+class PaperPki(Pki):
+    """Certificates that are named and never made."""
+
+    def __init__(self, folder: Path) -> None:
+        self.authority = Pair(folder / "ca.crt", folder / "ca.key")
+
+
+def test_nodes_share_no_folder_of_containerd(tmp_path: Path) -> None:
+    roots = set()
+    for index in (1, 2):
+        settings = tomllib.loads(Node(index, PaperPki(tmp_path)).containerd_settings())
+        assert settings["grpc"]["address"] == str(places.socket(index))
+        roots |= {settings["root"], settings["state"]}
+    assert len(roots) == 4
+
+
+@pytest.mark.parametrize(
+    ("cgroup", "ours"),
+    [
+        ("12:memory:/fiber-node-1/kubepods/burstable/pod1/abc", True),
+        ("0::/fiber-node-12/kubepods/pod1/abc", True),
+        ("0::/kubepods/pod1/abc", False),
+        ("0::/user.slice", False),
+    ],
+)
+def test_a_process_of_our_pods_is_known_by_its_cgroup(cgroup: str, ours: bool) -> None:
+    assert cgroups.holds_a_pod(cgroup) is ours
+
+
+def test_a_shim_is_ours_if_its_containerd_is() -> None:
+    shim = b"/usr/bin/containerd-shim-runc-v2"
+    socket = str(places.socket(1)).encode()
+    assert remains.is_shim([shim, b"-namespace", b"k8s.io", b"-address", socket])
+    assert not remains.is_shim([shim, b"-address", b"/run/containerd/containerd.sock"])
+    assert not remains.is_shim([b"tail", b"-f", socket])
+
+
+@pytest.mark.parametrize(
+    ("runs", "whole", "cleared"),
+    [(True, True, False), (True, False, True), (False, True, True)],
+    ids=["whole", "after-a-reboot", "without-processes"],
+)
+def test_a_whole_cluster_is_used_and_remains_of_one_are_cleared(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    runs: bool,
+    whole: bool,
+    cleared: bool,
+) -> None:
+    times: list[bool] = []
+    monkeypatch.setattr(lifecycle, "take_down", lambda: times.append(True))
+    monkeypatch.setattr(network, "is_there", lambda _: whole)
+    if runs:
+        Daemon("etcd").start(*SLEEP)
+    found = Found("/home/me/fiber", str(places.cache()), 2)
+    found.write()
+    assert lifecycle.find() == (found if runs else None)
+    assert lifecycle.keep_or_clear() == (None if cleared else found)
+    assert bool(times) is cleared
+    if not cleared:
+        assert "brought up from /home/me/fiber" in capsys.readouterr().err
+
+
+def test_a_cluster_of_other_versions_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(network, "is_there", lambda _: True)
+    Daemon("etcd").start(*SLEEP)
+    Found("/home/me/fiber", "/cache/kubernetes-1.20.0", 2).write()
+    with pytest.raises(ClusterError, match=r"1\.20\.0, 2 nodes, .* \(make cluster-down\)"):
+        lifecycle.keep_or_clear()
+
+
+@pytest.mark.parametrize("text", ["", "[]", '{"checkout": 1}', "not json"])
+def test_a_damaged_record_is_no_cluster(text: str) -> None:
+    Daemon("etcd").start(*SLEEP)
+    (places.STATE / "cluster.json").write_text(text)
+    assert lifecycle.find() is None

@@ -1,16 +1,17 @@
-"""Fiber's images: what their tags stand for, and that they are built when that has changed."""
+"""Fiber's images: a tag stands for contents, and an image is built when these have changed."""
 
 from __future__ import annotations
 
 import os
 import re
+import stat
 from pathlib import Path
 
 import pytest
 
 from cluster import builders, images, places
-from cluster.builders import Builder
-from cluster.images import IMAGES, OPERATOR, SEARCH, WORKER, WORKER_RL, Image
+from cluster.builders import Buildah, Builder, Docker
+from cluster.images import IMAGES, OPERATOR, SEARCH, WORKER, Image
 from cluster.shell import ClusterError
 
 BASE = "python:3.11-slim"
@@ -81,6 +82,7 @@ def test_a_tag_stands_for_contents(image: Image, checkout: Path) -> None:
     os.utime(checkout / SHARED_MODULE, (0, 0))
     write(checkout / "crds/fiber_api/__pycache__/names.pyc", "compiled")
     write(checkout / "docs/index.md", "not in any image")
+    write(checkout / (SDK_MODULE if image is OPERATOR else OPERATOR_MODULE), "the other side's")
     assert image.reference(checkout, BASE) == before
     assert image.reference(checkout, "python:3.13-slim") != before
     write(checkout / SHARED_MODULE, "something else")
@@ -96,57 +98,67 @@ def test_a_tag_identifies_the_files(checkout: Path) -> None:
     assert WORKER.reference(checkout, BASE) != before
 
 
-@pytest.mark.parametrize(("image", "foreign"), [(OPERATOR, SDK_MODULE), (WORKER, OPERATOR_MODULE)])
-def test_neither_image_depends_on_the_other_side(
-    image: Image, foreign: str, checkout: Path
+def test_changed_images_and_missing_archives_alone_are_built(
+    builder: Notebook, checkout: Path
 ) -> None:
-    before = image.reference(checkout, BASE)
-    write(checkout / foreign, "something else")
-    assert image.reference(checkout, BASE) == before
-
-
-def test_only_changed_images_are_built(builder: Notebook, checkout: Path) -> None:
     first = images.build_images()
     assert builder.asked == list(first.values())
     assert list(first) == ["fiber-operator", "fiber-worker", "fiber-worker-rl"]
+    tags = {name: reference.partition(":")[2] for name, reference in first.items()}
+    assert tags["fiber-worker"] != tags["fiber-worker-rl"]
+    for image in IMAGES:
+        assert image.archive.read_text() == image.archived() == first[image.name]
     assert images.build_images() == first
     write(checkout / OPERATOR_MODULE, "something else")
     second = images.build_images()
     assert builder.asked[3:] == [second["fiber-operator"]]
     assert builder.removed == [first["fiber-operator"]]
     assert second["fiber-worker"] == first["fiber-worker"]
-
-
-def test_a_missing_archive_is_made_again(builder: Notebook) -> None:
-    first = images.build_images()
     WORKER.archive.unlink()
-    assert images.build_images() == first
-    assert builder.asked[3:] == [first["fiber-worker"]]
+    assert images.build_images() == second
+    assert builder.asked[4:] == [second["fiber-worker"]]
 
 
-def test_an_archive_matches_its_record(builder: Notebook) -> None:
+def test_a_build_that_fails_is_done_again(builder: Notebook, checkout: Path) -> None:
+    images.build_images()
+    write(checkout / SDK_MODULE, "something else")
+    builder.fails = True
+    with pytest.raises(ClusterError, match="unwell"):
+        images.build_images()
+    assert WORKER.archived() is None
+    builder.fails = False
     references = images.build_images()
-    for image in IMAGES:
-        assert image.archive.read_text() == image.archived() == references[image.name]
+    assert builder.asked[3:] == [references["fiber-worker"], references["fiber-worker-rl"]]
 
 
-def test_nodes_get_only_missing_images_and_tag_them_with_the_version(
-    builder: Notebook, monkeypatch: pytest.MonkeyPatch
+def test_an_image_on_top_of_ours_follows_it(builder: Notebook, checkout: Path) -> None:
+    first = images.build(SEARCH)
+    worker = WORKER.archived()
+    assert worker is not None
+    assert builder.asked == [worker, first]
+    assert f"BASE_IMAGE={worker}" in builder.options
+    assert images.build(SEARCH) == first
+    write(checkout / SDK_MODULE, "something else")
+    second = images.build(SEARCH)
+    assert second != first
+    assert builder.asked[2:] == [WORKER.archived(), second]
+    assert builder.removed == [worker, first]
+
+
+def test_a_build_sees_the_inputs_the_base_and_the_version_alone(
+    builder: Notebook, checkout: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    nodes = {index: FakeNode() for index in (1, 2)}
-    monkeypatch.setattr(places, "nodes", lambda: list(nodes))
-    monkeypatch.setattr(images, "Containerd", lambda index: nodes[index])
-    references = images.bring_images()
-    nodes[2].there.remove(images.full_name(references["fiber-worker"]))
-    images.bring_images()
-    for node in nodes.values():
-        assert node.names == {
-            f"docker.io/library/{name}:1.2.3": images.full_name(reference)
-            for name, reference in references.items()
-        }
-    archives = [image.archive for image in IMAGES]
-    assert nodes[1].loaded == archives
-    assert nodes[2].loaded == [*archives, WORKER.archive]
+    monkeypatch.setenv("BASE_IMAGE", "python:3.13-slim")
+    write(checkout / "secret.txt", "not for the image")
+    images.build_images()  # the last image is the worker's with the packages of the examples
+    sources = {"sdk/Dockerfile", SHARED_MODULE, SDK_MODULE, images.VERSION_FILE}
+    assert builder.seen == {*images.ALWAYS, *sources}
+    for option in (
+        "BASE_IMAGE=base-of-python:3.13-slim",
+        "VERSION=1.2.3",
+        "EXTRAS=kubernetes,rl",
+    ):
+        assert option in builder.options
 
 
 class FakeNode:
@@ -169,78 +181,112 @@ class FakeNode:
         self.names[other] = reference
 
 
-def test_images_on_all_nodes_are_known(builder: Notebook, monkeypatch: pytest.MonkeyPatch) -> None:
-    nodes = {index: FakeNode() for index in (1, 2)}
-    monkeypatch.setattr(places, "nodes", lambda: list(nodes))
-    monkeypatch.setattr(images, "Containerd", lambda index: nodes[index])
-    assert images.brought(WORKER_RL) is None
-    references = images.bring_images()
-    assert images.brought(WORKER_RL) == references["fiber-worker-rl"]
-    nodes[2].there.clear()
-    assert images.brought(WORKER_RL) is None
-
-
-def test_workers_differ_by_their_extras(builder: Notebook, checkout: Path) -> None:
-    references = images.build_images()
-    assert "EXTRAS=kubernetes,rl" in builder.options  # the last that is built
-    tags = {name: reference.partition(":")[2] for name, reference in references.items()}
-    assert tags["fiber-worker"] != tags["fiber-worker-rl"]
-
-
-def test_an_image_on_top_of_ours_follows_it(builder: Notebook, checkout: Path) -> None:
-    first = images.build(SEARCH)
-    worker = WORKER.archived()
-    assert worker is not None
-    assert builder.asked == [worker, first]
-    assert f"BASE_IMAGE={worker}" in builder.options
-    assert images.build(SEARCH) == first
-    write(checkout / SDK_MODULE, "something else")
-    second = images.build(SEARCH)
-    assert second != first
-    assert builder.asked[2:] == [WORKER.archived(), second]
-    assert builder.removed == [worker, first]
-
-
-def test_an_image_that_few_need_is_brought_alone(
+def test_nodes_get_the_images_that_they_lack_under_the_version(
     builder: Notebook, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     nodes = {index: FakeNode() for index in (1, 2)}
     monkeypatch.setattr(places, "nodes", lambda: list(nodes))
     monkeypatch.setattr(images, "Containerd", lambda index: nodes[index])
+    assert images.brought(WORKER) is None
+    references = images.bring_images()
+    worker = references["fiber-worker"]
+    assert images.brought(WORKER) == worker
+    nodes[2].there.remove(images.full_name(worker))
+    assert images.brought(WORKER) is None
+    images.bring_images()
     assert images.bring(SEARCH) == SEARCH.archived()
-    images.bring(SEARCH)
-    assert [node.loaded for node in nodes.values()] == [[SEARCH.archive]] * 2
+    for node in nodes.values():
+        assert node.names == {
+            f"docker.io/library/{name}:1.2.3": images.full_name(reference)
+            for name, reference in references.items()
+        }
+    archives = [image.archive for image in IMAGES]
+    assert nodes[1].loaded == [*archives, SEARCH.archive]
+    assert nodes[2].loaded == [*archives, WORKER.archive, SEARCH.archive]
 
 
-def test_a_build_that_fails_is_done_again(builder: Notebook, checkout: Path) -> None:
-    images.build_images()
-    write(checkout / SDK_MODULE, "something else")
-    builder.fails = True
-    with pytest.raises(ClusterError, match="unwell"):
-        images.build_images()
-    assert WORKER.archived() is None
-    builder.fails = False
-    references = images.build_images()
-    assert builder.asked[3:] == [references["fiber-worker"], references["fiber-worker-rl"]]
+# -- Builders
 
 
-def test_a_build_sees_only_the_inputs(builder: Notebook, checkout: Path) -> None:
-    write(checkout / "secret.txt", "not for the image")
-    images.build_images()  # the worker's is the last
-    assert builder.seen == {
-        *images.ALWAYS,
-        "sdk/Dockerfile",
-        SHARED_MODULE,
-        SDK_MODULE,
-        images.VERSION_FILE,
-    }
+def install(monkeypatch: pytest.MonkeyPatch, folder: Path, name: str, script: str) -> None:
+    program = folder / name
+    program.write_text(f"#!/bin/sh\n{script}\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{folder}:{os.environ['PATH']}")
 
 
-def test_a_build_gets_base_and_version(builder: Notebook, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("BASE_IMAGE", "python:3.13-slim")
-    images.build_images()
-    assert "BASE_IMAGE=base-of-python:3.13-slim" in builder.options
-    assert "VERSION=1.2.3" in builder.options
+@pytest.mark.parametrize(
+    ("docker", "chosen"),
+    [("exit 0", Docker), ("echo 'no daemon' >&2; exit 1", Buildah)],
+    ids=["daemon", "command-alone"],
+)
+def test_buildah_builds_where_the_daemon_of_docker_does_not_run(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, docker: str, chosen: type[Builder]
+) -> None:
+    install(monkeypatch, tmp_path, "docker", docker)
+    install(monkeypatch, tmp_path, "buildah", "exit 0")
+    assert isinstance(builders.choose(), chosen)
+
+
+@pytest.mark.parametrize(
+    ("pulls", "wanted", "base"),
+    [
+        ("exit 0", "python:3.11-slim", "docker.io/library/python:3.11-slim"),
+        ("exit 1", "python:3.11-slim", "made of packages for 3.11"),
+        ("exit 1", "registry.example/our-python:1", "registry.example/our-python:1"),
+    ],
+    ids=["registry", "no-registry", "chosen"],
+)
+def test_a_base_is_pulled_or_made_of_packages(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, pulls: str, wanted: str, base: str
+) -> None:
+    install(monkeypatch, tmp_path, "buildah", f'case "$*" in *pull*) {pulls};; esac')
+    monkeypatch.setattr(builders, "base_image", lambda python: f"made of packages for {python}")
+    assert Buildah().base(wanted) == base
+
+
+def test_docker_builds_in_the_context_and_saves_the_archive(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    called, archive = tmp_path / "called", tmp_path / "out" / "image.tar"
+    script = f'echo "$PWD: $*" >> {called}; [ "$1" = build ] || touch "$3"'
+    install(monkeypatch, tmp_path, "docker", script)
+    Docker().build("image:1", tmp_path, "Dockerfile", {"BASE_IMAGE": "base:1"}, archive)
+    built, saved = called.read_text().splitlines()
+    assert built.startswith(f"{tmp_path}: build --quiet --tag image:1 --file Dockerfile")
+    assert " --build-arg BASE_IMAGE=base:1 " in built
+    assert saved.endswith(" image:1")
+    assert archive.exists()
+
+
+def test_a_build_gets_the_settings_of_pip_as_a_secret_that_is_removed(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    certificates = tmp_path / "certificates.crt"
+    certificates.write_text("trusted")
+    listed = [
+        ":env:.index-url='https://one.example'",
+        "global.index-url='https://two.example'",
+        r"global.extra-index-url='\nhttps://three.example\nhttps://four.example'",
+        f"global.cert='{certificates}'",
+        "global.disable-pip-version-check='1'",
+        ":env:.default-timeout='180'",
+    ]
+    monkeypatch.setattr(builders, "pip_config", lambda: listed)
+    with builders.secrets() as options:
+        assert options[:2] == ["--secret", f"id=certificates,src={certificates}"]
+        file = Path(options[3].removeprefix("id=pip,src="))
+        assert stat.S_IMODE(file.stat().st_mode) == 0o600
+        said = file.read_text().split()
+    assert not file.exists()
+    assert said[:4] == ["[global]", "cert", "=", "/run/secrets/certificates"]
+    for words in (
+        ["index-url", "=", "https://one.example"],
+        ["https://three.example", "https://four.example"],
+        ["timeout", "=", "180"],
+    ):
+        assert " ".join(words) in " ".join(said)
+    assert "two.example" not in " ".join(said)
 
 
 # The files of the repository itself.
