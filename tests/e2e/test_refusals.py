@@ -156,7 +156,12 @@ def test_a_name_that_is_taken(pool: Pool, agent: Body) -> None:
     before = scene.kube.create(service, body)
     pool.apply(agent, minReplicas=1)
     problem = pool.has_problem("NameTaken", severity="Error", terminal=True)
-    assert says(problem["message"], "Service es-fiber", "does not belong to this pool", "Delete or rename it")
+    assert says(
+        problem["message"],
+        "Service es-fiber",
+        "does not belong to this pool",
+        "Delete or rename it",
+    )
     assert scene.kube.get(f"{service}/es-fiber") == before
     assert not pool.ever
     scene.kube.delete(f"{service}/es-fiber")
