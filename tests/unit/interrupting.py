@@ -11,6 +11,8 @@ from typing import Any
 
 LINES = ("line", "return")
 INSTRUCTIONS = ("opcode",)
+CALLS = ("call", "c_return")
+"""Steps at which CPython runs signal handlers: a function begins, or a C function has returned."""
 
 
 def is_interrupted(
@@ -44,12 +46,16 @@ def is_interrupted(
 
     before, collects = sys.gettrace(), gc.isenabled()
     gc.disable()  # a finalizer of other tests' garbage would be struck, and shown
-    sys.settrace(trace)
+    if steps == CALLS:
+        sys.setprofile(trace)
+    else:
+        sys.settrace(trace)
     try:
         action()
     except KeyboardInterrupt:
         pass
     finally:
+        sys.setprofile(None)
         sys.settrace(before)
         if collects:
             gc.enable()

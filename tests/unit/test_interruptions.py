@@ -39,7 +39,7 @@ from fiber.connection import Connection, wait
 from fiber.results import IMapIterator
 from hosts import Hosts, objects_kept
 from patience import PATIENCE
-from unit.interrupting import INSTRUCTIONS, is_interrupted
+from unit.interrupting import CALLS, INSTRUCTIONS, is_interrupted
 from unit.pool_programs import run_program
 
 MORE_THAN_FITS = 2000
@@ -134,14 +134,24 @@ def test_ctrl_c_at_any_step_of_a_put_costs_no_place_and_no_join(
     assert steps > 10, "it was hardly interrupted"
 
 
-def test_ctrl_c_at_any_step_of_acquire_loses_no_token() -> None:
+def acquired_again() -> Any:
+    lock = fiber.RLock()
+    lock.acquire()
+    return lock
+
+
+@pytest.mark.parametrize("make", [fiber.Lock, fiber.RLock, fiber.Semaphore, acquired_again])
+def test_ctrl_c_in_acquire_leaves_the_lock_to_others(make: Callable[[], Any]) -> None:
     steps = 0
     while True:
-        semaphore = fiber.Semaphore(1)
+        lock = make()
         files = {shared_semaphore.__file__}
-        if not is_interrupted(semaphore.acquire, steps, files, steps=("line",)):
+        if not is_interrupted(lock.acquire, steps, files, steps=CALLS):
             break
-        assert semaphore.acquire(timeout=PATIENCE), f"interrupted at step {steps}"
+        if make is acquired_again:
+            lock.release()
+        taken = without_deadlock(lambda: [lock.acquire(timeout=PATIENCE)])  # noqa: B023
+        assert taken == [True], f"interrupted at step {steps}"
         steps += 1
     assert steps > 3, "it was hardly interrupted"
 

@@ -32,7 +32,8 @@ is dead, and all living processes have noted their tokens.  If the process dies 
 leaves ``stop`` and the mutex to the next one, which finds the same tokens lost, or fewer.
 
 A thread that is interrupted between two steps cannot know how far it got.  It leaves the slot as if
-its process had died: state = LEFT.
+its process had died: state = LEFT.  So others get a token that an interrupted ``acquire`` took.  A
+semaphore whose tokens are not revived may lose that token, as multiprocessing's may.
 
 A process that returns a token that it has not acquired returns the token of another process, or
 adds one.  From then on the holders are unknown, and tokens are not revived.
@@ -49,7 +50,7 @@ import warnings
 import weakref
 from _multiprocessing import SemLock  # type: ignore[import-not-found]  # it has no stub
 from collections.abc import Callable, Iterable, Iterator
-from itertools import compress, starmap
+from itertools import compress
 from multiprocessing import current_process
 from typing import TYPE_CHECKING, Any, Protocol, Self, cast
 
@@ -94,10 +95,7 @@ _STOP = 8 * _ATTENTION
 _ABANDONED = 8 * _ATTENTION + 1
 _LISTENS = 8 * _ATTENTION + 2
 _IS_STOPPED = 0xFF
-_IS_SPECIAL = 0xFFFF  # stopped or abandoned
 _IS_LISTENED_TO = 0xFF0000
-
-_NO_WAIT = (False,)
 
 _libc = ctypes.PyDLL(None, use_errno=True)
 
@@ -152,7 +150,7 @@ class SharedSemaphore:
 
     __slots__ = (
         "__weakref__", "_bytes", "_candidates", "_count", "_get_value", "_give", "_held", "_idle",
-        "_is_mine", "_is_mutex", "_is_recursive", "_is_zero", "_me", "_mutex", "_next_look",
+        "_is_mine", "_is_recursive", "_is_zero", "_me", "_mutex", "_next_look",
         "_revivals", "_ring", "_sem", "_take", "_words", "block", "kind", "maximum",
     )  # fmt: skip
 
@@ -165,7 +163,6 @@ class SharedSemaphore:
         self._bytes = block.view
         self._words = block.view.cast("q")
         self.maximum = self._words[_MAXIMUM]
-        self._is_mutex = self.maximum == 1
         self._is_recursive = kind == RECURSIVE
         self._mutex = RobustMutex(block.address + 8 * _MUTEX)
         self._sem = self._semlock(kind)
@@ -210,26 +207,7 @@ class SharedSemaphore:
         """Take a token; False if there is none within ``timeout`` seconds."""
         if self._is_recursive and self._is_mine():
             return self._acquire_again()
-        if self._is_mutex:
-            # The same as ``_try_acquire``, in fewer steps.
-            words = self._words
-            try:
-                slot = self._idle.pop()
-            except IndexError:
-                return self._acquire(block, timeout)
-            try:
-                words[slot] = _BUSY
-                if not words[_ATTENTION] & _IS_SPECIAL and self._take(False):
-                    # CPython runs signal handlers after a call, and no call follows from here on.
-                    words[slot] = _HELD
-                    self._held += (slot,)
-                    return True
-                words[slot] = _IDLE
-                self._idle += (slot,)
-            except BaseException:
-                self._leave(slot)
-                raise
-        return self._acquire(block, timeout)
+        return self._try_acquire() or self._wait(block, timeout)
 
     def release(self, *, wait: bool = True) -> bool:
         """Return a token; ValueError if the semaphore is at its maximum.
@@ -277,8 +255,7 @@ class SharedSemaphore:
 
     def try_acquire(self) -> bool | Abandoned:
         """Take a token if there is one.  Never wait, and look for no lost tokens."""
-        taken: list[int] = []
-        return self._try_acquire(_NO_WAIT, taken) and self._acquired_result()
+        return self._try_acquire()
 
     def abandon(self, holder: str) -> None:
         """Note for the next acquirer that the process ``holder`` ended with a token."""
@@ -288,29 +265,18 @@ class SharedSemaphore:
 
     # Steps
 
-    def _acquire(self, block: bool, timeout: float | None) -> bool | Abandoned:
-        taken: list[int] = []
-        try:
-            if self._try_acquire(_NO_WAIT, taken) or self._wait(block, timeout, taken):
-                return self._acquired_result()
-            return False
-        except BaseException:
-            if taken:
-                self.release()
-            raise
-
     def _acquire_again(self) -> bool:
-        taken: list[bool] = []
+        depth = self._count()
         try:
-            taken.extend(map(self._take, _NO_WAIT))
+            self._take(False)
             return True
         except BaseException:
-            if taken:
+            if self._count() > depth:
                 self._give()
             raise
 
-    def _try_acquire(self, wait: tuple[bool] | tuple[bool, float], taken: list[int]) -> bool:
-        """Try once.  On success the slot is in ``taken``, also if an interrupt follows."""
+    def _try_acquire(self, block: bool = False, timeout: float | None = None) -> bool | Abandoned:
+        """Try once.  The result is ``Abandoned`` for the first acquirer after a holder's death."""
         try:
             slot = self._idle.pop()
         except IndexError:
@@ -318,26 +284,19 @@ class SharedSemaphore:
         words = self._words
         try:
             words[slot] = _BUSY
-            if not words[_ATTENTION] & _IS_STOPPED:
-                # One call takes the token and adds the slot: no signal handler runs in between.
-                taken.extend(compress((slot,), starmap(self._take, (wait,))))
+            taken = not words[_ATTENTION] & _IS_STOPPED and self._take(block, timeout)
+            if taken and self._bytes[_ABANDONED]:
+                taken = self._last_holder()
         except BaseException:
-            if taken:
-                words[slot] = _HELD
-                self._held += (slot,)
-            else:
-                self._leave(slot)
+            self._leave(slot)
             raise
-        if not taken:
-            words[slot] = _IDLE
-            self._idle += (slot,)
-            return False
-        words[slot] = _HELD
-        if slot == _NO_SLOT:  # no slot: the token has no note
-            self._idle += (slot,)
-        else:
+        # CPython runs signal handlers after a call.  No call follows, here and in the callers.
+        words[slot] = _HELD if taken else _IDLE
+        if taken and slot != _NO_SLOT:  # a token without a slot has no note
             self._held += (slot,)
-        return True
+        else:
+            self._idle += (slot,)
+        return taken
 
     def _give_untracked(self) -> None:
         """Return a token that this process has not acquired.  The caller holds the mutex."""
@@ -352,16 +311,13 @@ class SharedSemaphore:
             self._sem._after_fork()  # sets the count to zero: this thread no longer holds it
         self._words[slot] = _LEFT
 
-    def _acquired_result(self) -> bool | Abandoned:
-        """Return True, or ``Abandoned`` for the first acquirer after a holder's death."""
-        if not self._bytes[_ABANDONED]:
-            return True
+    def _last_holder(self) -> Abandoned:
         self._bytes[_ABANDONED] = 0
         return Abandoned(_text(self._bytes[8 * _DEAD.start : 8 * _DEAD.stop]))
 
     # Waiting
 
-    def _wait(self, block: bool, timeout: float | None, taken: list[int]) -> bool:
+    def _wait(self, block: bool, timeout: float | None) -> bool | Abandoned:
         deadline = None if timeout is None else time.monotonic() + timeout
         while True:
             left = SLICE if deadline is None else min(SLICE, deadline - time.monotonic())
@@ -370,10 +326,9 @@ class SharedSemaphore:
                 self._park()
             elif not self._look_after_the_dead() and not waits:
                 return False
-            if self._try_acquire((True, left) if waits else _NO_WAIT, taken):
-                return True
-            if not waits:
-                return False
+            taken = self._try_acquire(True, left) if waits else self._try_acquire()
+            if taken or not waits:
+                return taken
 
     def _is_stopped(self) -> bool:
         return bool(self._words[_ATTENTION] & _IS_STOPPED)
