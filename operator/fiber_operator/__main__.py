@@ -1,4 +1,4 @@
-"""``python -m fiber_operator``: run the operator until SIGTERM.  ``settings`` has its settings."""
+"""``python -m fiber_operator``: run the operator until SIGTERM.  Its settings: ``settings.py``."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from fiber_operator.process import OperatorProcess
 from fiber_operator.settings import OperatorSettings, SettingsError
 
 GARBAGE = 10_000
-"""New objects after which garbage is looked for."""
+"""New objects after which Python's garbage collector runs."""
 
 DEPTH = 30_000
-"""Kubernetes takes documents that are nested ten thousand deep.  At Python's own limit a single
-such pool would make the list of all pools unreadable."""
+"""Python's limit of recursion.  Kubernetes accepts documents that are nested ten thousand deep.  At
+Python's default limit, one such pool would make the list of all pools unreadable."""
 
 log = logging.getLogger("fiber_operator")
 
@@ -34,7 +34,7 @@ async def _operate(settings: OperatorSettings) -> None:
 
 
 def main() -> int:
-    """The process; the exit status is 0 after a signal, 2 if the settings make no sense."""
+    """Run the process.  Return the exit status: 0 after a signal, 2 if the settings are wrong."""
     try:
         settings = OperatorSettings.from_environment(os.environ)
     except SettingsError as error:
@@ -42,10 +42,10 @@ def main() -> int:
         return 2
     logs.set_up(settings.log_level, settings.log_format)
     sys.setrecursionlimit(DEPTH)
-    # Twice the lines for nothing that anybody asks for. The library types only a part of itself.
+    # They would double the lines of /metrics.  The library types only a part of itself.
     prometheus_client.disable_created_metrics()  # type: ignore[no-untyped-call]
-    # A list of pods is so many new objects that the collector begins many times over, to look at
-    # all that the libraries made: two thirds of the time that parsing took.
+    # A list of pods makes so many objects that the collector would run many times, and look at all
+    # objects of the libraries each time.  That took two thirds of the time of parsing.
     gc.freeze()
     gc.set_threshold(GARBAGE)
     try:

@@ -92,8 +92,8 @@ class PoolMemory:
     written: Mapping[str, Any] | None = None
     """Status that the API server returned for the last write; None if that is not known."""
     oversized: str = ""
-    """Why the operator does not read the spec: it has too many values.  Empty: it does."""
-    told: Mapping[str, Any] = field(default_factory=dict)
+    """Error of a spec that has too many values to be read; empty if it was read."""
+    blind_status: Mapping[str, Any] = field(default_factory=dict)
     """Last status that was written while the spec was not read; empty if none was."""
     generation: int = -1
     """Generation of the pool in this reconcile, or in the last one that did not fail."""
@@ -217,7 +217,7 @@ class Applier:
             answer = await self._cluster.patch(POOLS, *work.key, patch, "status")
             work.state.written = mapping(answer, "status")
         except Oversized:
-            work.state.told = work.plan.status
+            work.state.blind_status = work.plan.status
         except (Refused, Invalid) as error:
             event = PoolEvent("Warning", Reason.FORBIDDEN, messages.unwritable_status(error))
             self._tell(work, [event])
@@ -453,11 +453,11 @@ class Controller:
         state.generation = whole(mapping(document, "metadata").get("generation"))
         state.oversized = oversized
         if oversized:
-            document = {**document, "status": dict(state.told)}
+            document = {**document, "status": dict(state.blind_status)}
         return document, state
 
     async def _document(self, key: Key) -> tuple[Body, str]:
-        """Read the pool.  If it has too many values, return its metadata and what is wrong."""
+        """Read the pool.  If it has too many values, return its metadata and the error."""
         try:
             return await self._cluster.read(POOLS, *key), ""
         except Oversized as error:
@@ -540,10 +540,10 @@ class Controller:
         if dependents is not None and dependents.obstacles:
             wishes.append(OBSTRUCTED)
         again = min((max(wish, 0.0) for wish in wishes if wish is not None), default=None)
-        lull = bool(plan.create or plan.delete) or any(
+        early = bool(plan.create or plan.delete) or any(
             pod.state is not PodState.READY for pod in pods
         )
-        return dataclasses.replace(result, requeue_after=again, lull=lull)
+        return dataclasses.replace(result, requeue_after=again, early=early)
 
     def _drop(self, key: Key) -> None:
         self._states.pop(key, None)

@@ -1,34 +1,86 @@
 """Health of the operator, and the HTTP server of /healthz, /readyz and /metrics.
 
-"Not alive" means that this process is stuck and a restart may help.  "Not ready" means that pools
-are not served as they should be and a restart would change nothing.
+/healthz fails if this process is stuck, so that a restart may help.  /readyz fails if pools are not
+served as they should be and a restart would not help, for example because a right is missing.
 """
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import AsyncIterator, Awaitable, Callable
+import logging
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from dataclasses import dataclass
 
 from aiohttp import web
 
+from fiber_operator.cluster import PODS
 from fiber_operator.metrics import CONTENT_TYPE, Metrics
 from fiber_operator.operator_leases import LeaderElector
-from fiber_operator.watches import Resync, WatchStatus
+from fiber_operator.responses import ApiError, complaint
+from fiber_operator.resync import Resync
+from fiber_operator.watches import WATCHED
 from fiber_operator.workqueue import WorkQueue
 
-LATE_TURN = 30.0
-"""Seconds that a pool may wait for its reconcile while the operator is ready."""
-STUCK_TURN = 600.0
-"""Longer than any reconcile takes whose every call ends by its timeout."""
+log = logging.getLogger(__name__)
+
+
+LATE_RECONCILE = 30.0
+"""Seconds that a pool may wait for its reconcile.  After that the operator is not ready."""
+STUCK_RECONCILE = 600.0
+"""Seconds that a reconcile may take.  One in which every call times out takes less."""
 STUCK_QUEUE = 120.0
-"""Seconds without the end of any reconcile while a pool waits."""
+"""Seconds that may pass without the end of a reconcile while a pool waits."""
 MISSED_RESYNCS = 2.5
+"""Intervals of the resync that may pass without a list of all pools."""
+
+
+class WatchStatus:
+    """State of the watches of ``namespaces`` (empty: all), for /readyz."""
+
+    def __init__(self, namespaces: Sequence[str]) -> None:
+        self._required = [
+            f"watch {resource.plural}{where}"
+            for where in ([f" in {namespace}" for namespace in namespaces] or [""])
+            for resource in (*WATCHED, PODS)
+        ]
+        self._kopf_runs = False
+        self._open: set[str] = set()
+        """Watches that the API server has accepted, as in ``_required``."""
+        self._failures: dict[str, str] = {}
+        """Errors of lists and watches whose last attempt failed."""
+
+    def started(self, running: bool) -> None:
+        """Note that kopf has started (True) or ended (False), which begins its watches anew."""
+        self._kopf_runs = running
+        # The watch of pods is the informer's, and goes on.
+        self._open = {what for what in self._open if what.startswith(f"watch {PODS.plural}")}
+
+    def answered(self, what: str, error: ApiError | None) -> None:
+        """Note the answer to the list or watch ``what``."""
+        if error is None:
+            self._open.add(what)
+            if self._failures.pop(what, None):
+                log.info("%s works again", what)
+            return
+        failure = complaint(error)
+        if self._failures.get(what) != failure:
+            log.warning("changes are not seen: %s", failure)
+        self._failures[what] = failure
+
+    def problems(self) -> list[str]:
+        """Return the reasons why changes are not seen, or are seen late."""
+        problems = [f"changes are not seen: {failure}" for failure in self._failures.values()]
+        if not self._kopf_runs:
+            problems.append("kopf does not run: changes are seen late")
+        elif not problems:
+            missing = [what for what in self._required if what not in self._open]
+            problems += [f"changes are seen late: {what} has not begun yet" for what in missing]
+        return problems
 
 
 @dataclass
 class Health:
-    """Both checks.  Each returns what is wrong, a sentence each."""
+    """The checks of /healthz and /readyz.  Each returns a list of problems, one sentence each."""
 
     elector: LeaderElector
     queue: WorkQueue
@@ -37,51 +89,53 @@ class Health:
     clock: Callable[[], float]
 
     def __post_init__(self) -> None:
-        self._began = self.clock()
+        self._started = self.clock()
 
     def alive(self) -> list[str]:
-        """Why this process should be restarted."""
+        """Return the reasons to restart this process."""
         now, statistics = self.clock(), self.queue.statistics()
-        wrong = []
-        if statistics.longest_run > STUCK_TURN:
-            wrong.append(f"the reconcile of a pool takes {statistics.longest_run:.0f} s so far")
-        if min(statistics.longest_wait, statistics.since_last_end) > STUCK_QUEUE:
-            wrong.append(
-                f"no reconcile has ended for {statistics.since_last_end:.0f} s, and pools wait"
+        problems = []
+        if statistics.longest_run > STUCK_RECONCILE:
+            problems.append(
+                f"the reconcile of a pool has taken {statistics.longest_run:.0f} s so far"
             )
-        tried = now - (self._began if self.resync.tried is None else self.resync.tried)
-        # One list takes as long as its timeout where the API server is silent.
-        if tried > 2 * self.resync.seconds + 120:
-            wrong.append(f"the pools were not even tried to be listed for {tried:.0f} s")
-        return wrong
+        if min(statistics.longest_wait, statistics.since_last_end) > STUCK_QUEUE:
+            problems.append(
+                f"pools wait, and no reconcile has ended for {statistics.since_last_end:.0f} s"
+            )
+        silence = now - (self._started if self.resync.tried is None else self.resync.tried)
+        # If the API server does not answer, a list takes until its timeout.
+        if silence > 2 * self.resync.seconds + 120:
+            problems.append(f"the operator has not tried to list the pools for {silence:.0f} s")
+        return problems
 
     def ready(self) -> list[str]:
-        """Why pools are not served as they should be."""
+        """Return the reasons why pools are not served as they should be."""
         now, statistics = self.clock(), self.queue.statistics()
-        wrong = list(self.resync.failures.values())
+        problems = list(self.resync.failures.values())
         if not self.elector.is_leader:
-            wrong.append(f"this operator does not act: {self.elector.why}")
+            problems.append(f"this operator is not the leader: {self.elector.why}")
         if self.resync.succeeded is None:
-            wrong.append("the pools were not listed yet")
+            problems.append("the pools have not been listed yet")
         elif now - self.resync.succeeded > MISSED_RESYNCS * self.resync.seconds:
-            wrong.append(f"the pools were last listed {now - self.resync.succeeded:.0f} s ago")
-        wrong += self.watches.wrong()
-        if statistics.longest_wait > LATE_TURN:
-            wrong.append(f"a pool waits for its reconcile for {statistics.longest_wait:.0f} s")
-        return wrong
+            problems.append(f"the pools were last listed {now - self.resync.succeeded:.0f} s ago")
+        problems += self.watches.problems()
+        if statistics.longest_wait > LATE_RECONCILE:
+            problems.append(f"a pool has waited {statistics.longest_wait:.0f} s for its reconcile")
+        return problems
 
 
 # -- The server
 
 Check = Callable[[], list[str]]
-"""Function that returns a sentence for each trouble; none: all is well."""
+"""Returns a sentence for each problem."""
 
 
 @contextlib.asynccontextmanager
 async def serving(
     host: str, port: int, *, alive: Check, ready: Check, metrics: Metrics
 ) -> AsyncIterator[int]:
-    """Serve on ``host`` (empty: all addresses) and ``port`` (0: a free one, which is yielded)."""
+    """Serve on ``host`` (empty: all addresses) and ``port`` (0: a free one).  Yield the port."""
 
     async def show_metrics(request: web.Request) -> web.Response:
         return web.Response(body=metrics.render(), headers={"Content-Type": CONTENT_TYPE})
@@ -101,8 +155,8 @@ async def serving(
 
 def _handler(check: Check) -> Callable[[web.Request], Awaitable[web.Response]]:
     async def answer(request: web.Request) -> web.Response:
-        wrong = check()
-        text = "\n".join(wrong) if wrong else "ok"
-        return web.Response(status=503 if wrong else 200, text=text + "\n")
+        problems = check()
+        text = "\n".join(problems) if problems else "ok"
+        return web.Response(status=503 if problems else 200, text=text + "\n")
 
     return answer

@@ -1,4 +1,4 @@
-"""Cache of the workers' pods, fed by a list and by a watch from that list on.
+"""Cache of the workers' pods, filled by a list and kept current by a watch.
 
 ::
 
@@ -6,13 +6,12 @@
                                   ▲     │
            created, deleted ──────┘     └──pods(pool)────────► controller
 
-A watch may be behind what this operator did itself.  So the controller tells the informer what to
-expect: a pod that it created is in the cache from then on, and a pod that it deleted counts as
-terminating, even if the watch shows it otherwise.  Controllers of Kubernetes call this
-expectations.
+The watch may be behind the operator's own changes.  So the controller reports its changes to the
+informer.  A pod that it created is in the cache from then on.  A pod that it deleted counts as
+terminating, even if the watch shows it otherwise.  Kubernetes' controllers call this expectations.
 
-A watch that breaks off goes on where it was.  Where the API server has forgotten that moment (410
-Gone), the pods are listed again, and the list replaces the cache: a pod that is not in it is gone.
+A watch that breaks off is continued from its last version.  If the API server no longer has that
+version (410 Gone), the pods are listed again, and the list replaces the cache.
 """
 
 from __future__ import annotations
@@ -28,8 +27,7 @@ from fiber_api import names
 from fiber_operator.cluster import PODS, Cluster
 from fiber_operator.planning.documents import mapping, text
 from fiber_operator.planning.pods import PodState, PodView, observe, worker_container
-from fiber_operator.responses import ApiError, Body, Refused, Unavailable
-from fiber_operator.watches import Answered
+from fiber_operator.responses import Answered, ApiError, Body, Refused, Unavailable
 from fiber_operator.workqueue import Key
 
 PAUSES = (0.5, 1.0, 2.0, 5.0, 15.0)
@@ -49,8 +47,8 @@ log = logging.getLogger(__name__)
 class PodInformer:
     """Cache of the pods of ``namespaces`` (empty: all) that belong to pools.
 
-    ``changed`` is called with the pool of each pod that has changed, ``answered`` with what the
-    API server answers to each watch.  Everything runs in one event loop.
+    ``changed`` is called with the pool of each pod that has changed, ``answered`` with the result
+    of each watch.  Everything runs in one event loop.
     """
 
     def __init__(
@@ -79,17 +77,17 @@ class PodInformer:
 
     async def pods(self, key: Key, uid: str) -> list[PodView]:
         """Return the pods of the pool with that uid; raise ApiError if they are not known."""
-        return await self._of(key.namespace).pods(key.namespace, uid)
+        return await self._reflector(key.namespace).pods(key.namespace, uid)
 
     def created(self, namespace: str, document: Body) -> None:
         """Expect a pod that this operator has created."""
-        self._of(namespace).created(document)
+        self._reflector(namespace).created(document)
 
     def deleted(self, namespace: str, uid: str, *, gone: bool) -> None:
         """Expect the end of a pod that this operator has deleted.  ``gone``: it has ended."""
-        self._of(namespace).deleted(uid, gone=gone)
+        self._reflector(namespace).deleted(uid, gone=gone)
 
-    def _of(self, namespace: str) -> _Reflector:
+    def _reflector(self, namespace: str) -> _Reflector:
         return self._reflectors.get(namespace) or self._reflectors[None]
 
 
@@ -120,7 +118,7 @@ class _Reflector:
         """Pods by uid."""
         self._pools: dict[tuple[str, str], dict[str, PodView]] = {}
         """The same pods: namespace and uid of the pool -> uid of the pod -> view.  The uid alone
-        does not do: a pod of another namespace may have the label."""
+        is not enough: a pod of another namespace may have the label."""
         self._expected: dict[str, float] = {}
         """Pods that were created and that the watch has not shown: uid -> time of the event loop.
         The oldest is the first."""
@@ -131,7 +129,7 @@ class _Reflector:
         """Version that the watch goes on from.  Empty: the pods must be listed."""
         self._refreshes = 0
         self._settled = asyncio.Event()
-        """Set once the pods are known, or known not to be available."""
+        """Set once the pods are known, or ``_failure`` says why they are not."""
         self._failure: ApiError | None = None
         self._failures = 0
         """Attempts that failed since the last one that succeeded."""
@@ -155,7 +153,7 @@ class _Reflector:
             self._watching.reschedule(_now())
             self._watching = None  # it cannot be rescheduled again once it has expired
 
-    # What the operator does itself
+    # Changes by the operator
 
     def created(self, document: Body) -> None:
         uid = text(mapping(document, "metadata").get("uid"))
@@ -170,7 +168,7 @@ class _Reflector:
             self._ending.add(uid)
             self._put(uid, known._replace(view=_as_ending(known.view)))
 
-    # What the API server shows
+    # Changes that the API server reports
 
     async def run(self) -> None:
         while True:
@@ -184,18 +182,18 @@ class _Reflector:
                 if self._failures or isinstance(error, Refused):
                     self._failure, self._version = error, ""
                     self._settled.set()
-                    self._answered(self._what("watch"), error)
+                    self._answered(self._request_name("watch"), error)
                 pause = PAUSES[min(self._failures, len(PAUSES) - 1)]
                 self._failures += 1
                 await asyncio.sleep(pause)
 
     async def _follow(self) -> None:
-        """List if need be, and watch until the watch ends."""
+        """List the pods if the cache has no version, and watch until the watch ends."""
         while not self._version:
             await self._list()
-        with_limit = asyncio.timeout(None)
+        deadline = asyncio.timeout(None)
         try:
-            async with with_limit as self._watching:
+            async with deadline as self._watching:
                 await self._cluster.watch(
                     PODS,
                     self._namespace,
@@ -205,7 +203,7 @@ class _Reflector:
                     opened=self._opened,
                 )
         except TimeoutError:
-            if not with_limit.expired():
+            if not deadline.expired():
                 raise
         finally:
             self._watching = None
@@ -213,9 +211,9 @@ class _Reflector:
     def _opened(self) -> None:
         self._failure, self._failures = None, 0
         self._settled.set()
-        self._answered(self._what("watch"), None)
+        self._answered(self._request_name("watch"), None)
 
-    def _what(self, verb: str) -> str:
+    def _request_name(self, verb: str) -> str:
         return f"{verb} {PODS.plural}" + (f" in {self._namespace}" if self._namespace else "")
 
     async def _list(self) -> None:
@@ -236,7 +234,7 @@ class _Reflector:
                 self._settled.set()
 
     def _take(self, kind: str, document: Body) -> None:
-        """Take one event of the watch."""
+        """Apply one event of the watch to the cache."""
         metadata = mapping(document, "metadata")
         self._version = text(metadata.get("resourceVersion")) or self._version
         if kind == "DELETED":
@@ -248,10 +246,10 @@ class _Reflector:
             self.refresh()
 
     def _show(self, document: Body) -> str:
-        """Keep a pod that the API server shows; return its uid."""
+        """Put a pod of a list or watch into the cache.  Return its uid."""
         uid = text(mapping(document, "metadata").get("uid"))
         if not uid:
-            raise Unavailable("a pod has no uid", what=self._what("watch"))
+            raise Unavailable("a pod has no uid", what=self._request_name("watch"))
         self._expected.pop(uid, None)
         self._keep(document)
         return uid
@@ -309,5 +307,5 @@ def _as_ending(view: PodView) -> PodView:
 
 
 def _same(one: PodView, other: PodView) -> bool:
-    """Tell whether the views differ in nothing but their version."""
+    """Return True if the views are equal except for their version."""
     return dataclasses.replace(one, resource_version=other.resource_version) == other

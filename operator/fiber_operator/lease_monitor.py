@@ -1,12 +1,12 @@
-"""Monitor of the masters' Leases, by which the operator knows whether masters live.
+"""Monitor of the masters' Leases, which tells whether the master of a pool is alive.
 
 A master is alive while its Lease changes.  One watch (``watches.py``) reports the changes of all
-masters' Leases, selected by their label.  The monitor reads a Lease itself only when its master is
-new, and twice before it calls the master lost, since a watch may be late or broken.  So a thousand
-healthy masters cost no requests.
+masters' Leases.  A watch may be late or broken.  So the monitor reads a Lease itself when its
+master is new, and twice before it declares the master lost.  A thousand healthy masters cost no
+requests.
 
-Only this process's monotonic clock counts, and only time in which the Lease could be read: while
-the API server cannot be reached, a master cannot renew its Lease either.
+The monitor measures time with this process's monotonic clock.  Time in which the Lease could not be
+read does not count: a master could not renew it either.
 """
 
 from __future__ import annotations
@@ -30,44 +30,47 @@ log = logging.getLogger(__name__)
 
 
 CONFIRMED_AFTER = 1 / 3
-"""Share of the duration in which an unchanged Lease must change before its master is lost.  The SDK
-renews as often, so a master that could not renew for a while gets its turn."""
+"""Share of the duration for which the monitor waits once more after a Lease has expired.  The SDK
+renews this often, so a master that could not renew for a while has time for one renewal."""
 MISSING_AFTER = 5.0
-"""Seconds after which a Lease that is not there is missed: a program makes it after its pool."""
+"""Seconds until a Lease that does not exist is reported.  A program makes its Lease after its
+pool."""
 RECHECK = 60.0
 """Seconds after which the Lease of a lost master is read again."""
-AT_ONCE = 8
-"""Leases that are read at the same time."""
+READS_AT_ONCE = 8
+"""Leases that are read at the same time, at most."""
 
 
 class MasterLease(NamedTuple):
-    """Master of a pool that is watched.  Another epoch is another master."""
+    """Lease of one master of a pool."""
 
     name: str
     epoch: int
+    """Number of the master: each master of a pool has another."""
     seconds: float
+    """Duration of the Lease."""
 
 
 @dataclass
 class _Watched:
     lease: MasterLease
     changed: float
-    """Time at which the Lease was first seen in its present state."""
+    """Time of the last change that was seen."""
     due: float
-    """Time at which to read the Lease."""
+    """Time of the next read."""
     version: str | None = None
-    """Version of the Lease; empty: there is no such Lease, None: it was not read yet."""
-    doubted: bool = False
-    """A read has found it unchanged for the whole duration."""
+    """resourceVersion of the Lease; empty: it does not exist, None: it was not read yet."""
+    suspected: bool = False
+    """True if a read has found that the Lease has expired."""
     verdict: LeaseVerdict = field(default_factory=LeaseVerdict)
 
-    def begin_anew(self, now: float) -> None:
-        """The whole duration is the master's again."""
-        self.changed, self.due, self.doubted = now, now + self.lease.seconds, False
+    def restart_clock(self, now: float) -> None:
+        """Give the master the whole duration of its Lease again."""
+        self.changed, self.due, self.suspected = now, now + self.lease.seconds, False
 
 
 class LeaseMonitor:
-    """Watches the Leases that pools name and tells when a verdict changes."""
+    """Observer of the Leases that pools name; calls ``on_change`` when a verdict changes."""
 
     def __init__(self, cluster: Cluster, on_change: Callable[[Key], None]) -> None:
         self._cluster = cluster
@@ -78,7 +81,7 @@ class LeaseMonitor:
         self._wake = asyncio.Event()
 
     def follow(self, key: Key, lease: MasterLease | None) -> LeaseVerdict:
-        """Watch this master of the pool from now on (None: none) and say what is known of it."""
+        """Observe this Lease for the pool from now on (None: no Lease); return its verdict."""
         watched = self._watched.get(key)
         if watched is not None and watched.lease == lease:
             return watched.verdict
@@ -90,27 +93,33 @@ class LeaseMonitor:
             self._wake.set()
         return LeaseVerdict()
 
-    def heard(self, namespace: str, name: str, version: str, connected: int | None = None) -> None:
-        """The watch says what a Lease's resourceVersion is now; empty: it was deleted.
+    def lease_changed(
+        self, namespace: str, name: str, version: str, connected: int | None = None
+    ) -> None:
+        """Note the resourceVersion (empty: deleted) of a Lease that the watch has reported.
 
-        ``connected`` is how many agents the master says it has.
+        ``connected`` is the number of agents that the master has, if the Lease says so.
         """
         for key in tuple(self._pools.get((namespace, name), ())):
-            self._see(key, self._watched[key], version, connected)
+            self._note_state(key, self._watched[key], version, connected)
 
     async def run(self) -> None:
-        """Read the Leases of which nothing is heard, until cancelled."""
+        """Read the Leases whose changes the watch does not report, until cancelled."""
         while True:
             self._wake.clear()
-            due = in_turn(key for key, seen in self._watched.items() if seen.due <= self._now())
-            for start in range(0, len(due), AT_ONCE):
-                await asyncio.gather(*(self._read(key) for key in due[start : start + AT_ONCE]))
+            due = in_turn(
+                key for key, watched in self._watched.items() if watched.due <= self._now()
+            )
+            for start in range(0, len(due), READS_AT_ONCE):
+                await asyncio.gather(
+                    *(self._read(key) for key in due[start : start + READS_AT_ONCE])
+                )
             soonest = min((watched.due for watched in self._watched.values()), default=None)
             try:
                 async with asyncio.timeout_at(soonest):
                     await self._wake.wait()
             except TimeoutError:
-                pass  # one is due
+                pass  # a read is due
 
     def _forget(self, key: Key, watched: _Watched) -> None:
         del self._watched[key]
@@ -130,26 +139,26 @@ class LeaseMonitor:
             version = text(mapping(lease, "metadata").get("resourceVersion"))
             connected = connected_in(lease)
         except Gone:
-            version = ""  # judged like one that does not change: it may be made yet
+            version = ""  # as if it did not change: the program may still make it
         except ApiError as error:
             log.warning("the master's Lease cannot be read: %s", error, extra=about(*key))
-            watched.begin_anew(self._now())
+            watched.restart_clock(self._now())
             if isinstance(error, Refused):
                 watched.version = None
                 self._conclude(key, watched, LeaseVerdict(unreadable=error.message))
             return
-        if self._see(key, watched, version, connected):
+        if self._note_state(key, watched, version, connected):
             return
         if late and watched.verdict.alive is not False:
-            # This process was stopped, or busy: what did not reach it meanwhile says nothing.
-            watched.begin_anew(self._now())
+            # This process was stopped or busy, and may have missed changes.
+            watched.restart_clock(self._now())
         else:
-            self._find_unchanged(key, watched)
+            self._judge_unchanged(key, watched)
 
-    def _see(self, key: Key, watched: _Watched, version: str, connected: int | None) -> bool:
-        """Note the state of a Lease; return whether it has changed.
+    def _note_state(self, key: Key, watched: _Watched, version: str, connected: int | None) -> bool:
+        """Note the state of a Lease.  Return True if it has changed.
 
-        To find it is no sign of life, for it may be that of a master that died long ago.
+        The first read does not show that the master lives: a dead master may have left the Lease.
         """
         before, watched.version = watched.version, version
         if before is None and not version:
@@ -159,21 +168,21 @@ class LeaseMonitor:
             return False
         alive = watched.verdict.alive
         if before is None or version:
-            watched.begin_anew(self._now())
+            watched.restart_clock(self._now())
             alive = None if before is None else True
-        # Until it changes, it may be the word of the master before.
-        said = connected if alive else None
-        self._conclude(key, watched, LeaseVerdict(alive, missing=not version, connected=said))
+        # Until the Lease changes, the number may be that of an earlier master.
+        counted = connected if alive else None
+        self._conclude(key, watched, LeaseVerdict(alive, missing=not version, connected=counted))
         return True
 
-    def _find_unchanged(self, key: Key, watched: _Watched) -> None:
+    def _judge_unchanged(self, key: Key, watched: _Watched) -> None:
         now, seconds = self._now(), watched.lease.seconds
         if not (watched.version or watched.verdict.missing):
             self._conclude(key, watched, replace(watched.verdict, missing=True))
         if now - watched.changed < seconds:
             watched.due = watched.changed + seconds
-        elif not watched.doubted:
-            watched.doubted, watched.due = True, now + seconds * CONFIRMED_AFTER
+        elif not watched.suspected:
+            watched.suspected, watched.due = True, now + seconds * CONFIRMED_AFTER
         else:
             watched.due = now + max(RECHECK, seconds)
             self._conclude(key, watched, LeaseVerdict(alive=False, missing=not watched.version))
@@ -188,15 +197,15 @@ class LeaseMonitor:
 
 
 def connected_in(lease: object) -> int | None:
-    """Return how many agents the Lease says its master has, if it says so."""
-    said = text(mapping(lease, "metadata", "annotations").get(ANNOTATION_CONNECTED))
-    return int(said) if said.isascii() and said.isdigit() and len(said) < 10 else None
+    """Return the number of agents that the Lease's annotation gives, or None."""
+    number = text(mapping(lease, "metadata", "annotations").get(ANNOTATION_CONNECTED))
+    return int(number) if number.isascii() and number.isdigit() and len(number) < 10 else None
 
 
 def in_turn(keys: Iterable[Key]) -> list[Key]:
-    """Return ``keys`` with one of each namespace first, then a second of each, and so on."""
+    """Return ``keys`` so that namespaces take turns: the first of each, the second of each, …"""
     namespaces: dict[str, list[Key]] = {}
     for key in keys:
         namespaces.setdefault(key.namespace, []).append(key)
     rounds = zip_longest(*namespaces.values())
-    return [key for found in rounds for key in found if key is not None]
+    return [key for keys_of_round in rounds for key in keys_of_round if key is not None]

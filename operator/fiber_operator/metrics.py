@@ -22,7 +22,7 @@ _SECONDS = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
 
 @dataclass(frozen=True)
 class PoolSample:
-    """Numbers of one pool, as of its last reconcile."""
+    """Numbers of one pool at its last reconcile."""
 
     desired: int = 0
     pods: Mapping[str, int] = field(default_factory=dict)
@@ -34,7 +34,7 @@ class PoolSample:
 
     @classmethod
     def of(cls, status: Mapping[str, Any], pods: Sequence[PodView]) -> PoolSample:
-        """The sample of a pool with this status, which may hold anything."""
+        """Return the sample of a pool with this status, whose fields may have any type."""
         failures = mapping(status, "failures")
         return cls(
             desired=whole(status.get("desiredReplicas")),
@@ -63,18 +63,18 @@ class Metrics:
         )
         self._reconcile_seconds = self._histogram("reconcile_duration", "Length of a reconcile.")
         self._requests = self._counter(
-            "api_requests", "Calls of the API server.", "verb", "resource", "code"
+            "api_requests", "Calls to the API server.", "verb", "resource", "code"
         )
         self._request_seconds = self._histogram(
-            "api_request_duration", "Length of a call of the API server.", "verb", "resource"
+            "api_request_duration", "Length of a call to the API server.", "verb", "resource"
         )
         self._created = self._counter("pods_created", "Pods created.")
         self._deleted = self._counter("pods_deleted", "Pods deleted, by reason.", "reason")
         self._watch_events = self._counter("watch_events", "Events of watches.", "resource")
-        self._watch_restarts = self._counter("watch_restarts", "Times that watching began anew.")
+        self._watch_restarts = self._counter("watch_restarts", "Times that kopf was started again.")
         self._resync = Gauge(
             "fiber_operator_last_resync_timestamp_seconds",
-            "When all pools were last listed.",
+            "Time at which all pools were last listed.",
             registry=self.registry,
         )
 
@@ -89,61 +89,61 @@ class Metrics:
     def watch_queue(
         self, statistics: Callable[[], QueueStatistics], held: Callable[[], bool]
     ) -> None:
-        """Show the queue, and whether this operator acts, as they are when Prometheus asks."""
+        """Add gauges that Prometheus reads from the queue and from ``held`` (is it the leader?)."""
         gauges: dict[tuple[str, str], Callable[[], float]] = {
             ("pools", "Pools that the operator knows."): lambda: statistics().known,
             ("queue_waiting", "Pools whose reconcile is due."): lambda: statistics().waiting,
-            ("queue_running", "Reconciles under way."): lambda: statistics().running,
+            ("queue_running", "Running reconciles."): lambda: statistics().running,
             (
                 "queue_longest_wait_seconds",
-                "How long the reconcile is overdue that waits longest.",
+                "Seconds for which the longest waiting pool is overdue.",
             ): lambda: statistics().longest_wait,
             (
                 "queue_longest_run_seconds",
-                "Length so far of the longest reconcile under way.",
+                "Seconds since the oldest running reconcile began.",
             ): lambda: statistics().longest_run,
-            ("lease_held", "1 while this operator acts."): lambda: float(held()),
+            ("lease_held", "1 while this operator is the leader."): lambda: float(held()),
         }
         for (name, meaning), value in gauges.items():
             Gauge(f"fiber_operator_{name}", meaning, registry=self.registry).set_function(value)
 
     def reconciled(self, outcome: str, seconds: float) -> None:
-        """A reconcile ended."""
+        """Count the end of a reconcile."""
         self._reconciles.labels(outcome).inc()
         self._reconcile_seconds.observe(seconds)
 
     def requested(self, verb: str, resource: str, code: str, seconds: float) -> None:
-        """A call of the API server ended."""
+        """Count the end of a call to the API server."""
         self._requests.labels(verb, resource, code).inc()
         self._request_seconds.labels(verb, resource).observe(seconds)
 
     def created(self, pods: int) -> None:
-        """Pods were created."""
+        """Count pods that were created."""
         self._created.inc(pods)
 
     def deleted(self, reason: str) -> None:
-        """A pod was deleted."""
+        """Count a pod that was deleted."""
         self._deleted.labels(reason).inc()
 
     def watched(self, resource: str) -> None:
-        """An event came."""
+        """Count an event of a watch."""
         self._watch_events.labels(resource).inc()
 
     def watch_restarted(self) -> None:
-        """Watching begins anew."""
+        """Count a new start of kopf."""
         self._watch_restarts.inc()
 
     def resynced(self, now: float) -> None:
-        """All pools were listed."""
+        """Note the time at which all pools were listed."""
         self._resync.set(now)
 
     def render(self) -> bytes:
-        """The page of /metrics."""
+        """Return the page of /metrics."""
         return generate_latest(self.registry)
 
 
 class _Pools(Collector):
-    """The metrics of each pool, which go when the pool goes."""
+    """Metrics of the pools that exist."""
 
     def __init__(self, pools: Mapping[Key, PoolSample]) -> None:
         self._pools = pools

@@ -1,16 +1,16 @@
-"""Leases that the operator itself holds: one to act, and one to show programs that it serves.
+"""Leases of the operator itself: one for leader election, and one that shows programs that it runs.
 
-Leader election: of several processes of one release, at most one acts.  Each process judges by its
-monotonic clock whether another process's Lease has expired, from the moment it last saw that Lease
-change.  Clocks of different machines are never compared.  The holder counts its time from before
-its request.  It starts no write after two thirds of that time, and limits each write, so that none
-is under way when another process may begin::
+Leader election: of the processes of one release, only the leader changes objects.  Each process
+measures with its monotonic clock whether the leader's Lease has expired, from the moment at which
+it last saw that Lease change.  It never compares clocks of two machines.  The leader measures its
+time from the moment before its request.  It starts no write after two thirds of that time, and
+limits the duration of each write.  So no write runs when another process becomes the leader::
 
     request                       the last write starts    the last write ends  others may begin
       |------ 2/3 of the duration ------|-----------------------|-------- 1/10 --------|
 
-The heartbeat locks nothing: each operator that serves a namespace writes the same Lease, and
-programs only look whether it is fresh.
+The heartbeat is no lock: each operator that serves a namespace writes the same Lease, and programs
+only check that it is recent.
 """
 
 from __future__ import annotations
@@ -31,22 +31,28 @@ log = logging.getLogger(__name__)
 
 
 HELD_SHARE = 2 / 3
-"""Share of the duration for which a renewal lets the holder act."""
+"""Share of the duration in which the leader may start writes after a renewal."""
 WRITTEN_SHARE = 9 / 10
-"""Share of the duration after which its last write has ended.  The rest is for differing clocks."""
-LONGEST_PATIENCE = 10
-"""Times this operator's own duration that a Lease lasts which is not renewed, whatever it says: an
-account that may write it must not stop the operator for years."""
+"""Share of the duration after which the last write has ended.  The rest allows for clock drift."""
+LONGEST_DURATION = 10
+"""Longest duration that another process's Lease may claim, in durations of this operator.  An
+account that may write the Lease must not stop the operator for years."""
 RENEW_SHARE = 1 / 3
+"""Share of the duration between two renewals."""
 RETRY_SHARE = 1 / 8
+"""Share of the duration between two attempts to become the leader."""
 
 
 class NotLeader(Exception):
-    """The Lease that this operator needs to change anything is not its own."""
+    """Error of a write while this operator is not the leader."""
 
 
 class LeaderElector:
-    """Gets and keeps the Lease.  ``on_change`` is called with whether this operator may act."""
+    """Candidate for the Lease of the leader.
+
+    ``on_change`` is called with True when this operator becomes the leader, and with False when it
+    stops being the leader.
+    """
 
     def __init__(
         self,
@@ -68,83 +74,94 @@ class LeaderElector:
         self._on_change = on_change
         self._clock = clock or asyncio.get_running_loop().time
         self._wall_clock = wall_clock
-        self._asked = float("-inf")
-        """Time at which it asked for the Lease that it holds."""
+        self._renewed_at = float("-inf")
+        """Time just before the last request that renewed the Lease."""
         self._failures = 0
-        self._told = False
+        """Requests that failed one after the other."""
+        self._reported = False
+        """Last value that ``on_change`` got."""
         self._lease: Body | None = None
-        self._seen: tuple[object, ...] = ()
-        self._seen_at = 0.0
+        self._other: tuple[object, ...] = ()
+        """State in which the Lease of another process was last seen."""
+        self._other_since = 0.0
+        """Time at which ``_other`` was first seen."""
         self._resigned = False
-        self.why = "the Lease was not read yet"
-        """Why this operator does not act; empty while it does."""
+        self.why = "it has not read the Lease yet"
+        """Reason why this operator is not the leader; empty while it is."""
 
     @property
     def is_leader(self) -> bool:
-        """True while this operator may act."""
+        """True while this operator may change objects."""
         return self._clock() < self._until
 
     @property
     def _until(self) -> float:
-        return self._asked + HELD_SHARE * self._seconds
+        return self._renewed_at + HELD_SHARE * self._seconds
 
     def require(self) -> float:
-        """The seconds that a write may last which begins now; NotLeader if none may begin."""
+        """Return the seconds that a write may last which begins now.  Raises NotLeader."""
         now = self._clock()
         if now >= self._until:
-            raise NotLeader(f"this operator does not hold the Lease {self._name}: {self.why}")
-        return self._asked + WRITTEN_SHARE * self._seconds - now
+            raise NotLeader(
+                f"this operator does not hold the Lease {self._name}, because {self.why}"
+            )
+        return self._renewed_at + WRITTEN_SHARE * self._seconds - now
 
     async def run(self) -> None:
         """Get the Lease and renew it until cancelled."""
         while True:
             pause = await self.step()
-            self._tell()
+            self._report()
             await asyncio.sleep(pause)
 
     def resign(self) -> None:
-        """Act no more from now on.  The Lease stays until ``release``, so that what is under way
-        can end before another operator begins."""
+        """Stop being the leader, but keep the Lease until ``release``.
+
+        So running calls can end before another operator begins.
+        """
         self._resigned = True
         self._lose("this operator is stopping")
 
     async def release(self) -> None:
-        """Let another operator begin at once, if the API server can be had.  After ``resign``."""
+        """Give up the Lease, so that another operator may begin at once.  Call ``resign`` first."""
         try:
             lease = await self._read()
             if _spec(lease).get("holderIdentity") == self._identity:
                 await self._write(lease, holder="", seconds=1)
         except ApiError as error:
-            log.warning("the Lease could not be released: %s", error)
+            log.warning(
+                "the Lease is kept until it expires, as its release failed: %s",
+                error,
+            )
 
     async def step(self) -> float:
-        """Ask for the Lease, or renew it; returns the seconds until the next step is due."""
+        """Take or renew the Lease if possible.  Return the seconds until the next step."""
         started = self._clock()
         try:
             if self._lease is None or not self.is_leader:
                 self._lease = await self._read()
             try:
-                await self._ask(started)
+                await self._take_or_renew(started)
             except (Conflict, Gone):
-                # By somebody else, or by us and the answer was lost: what it says now decides.
+                # Another process wrote it, or the answer to this one was lost: read the holder.
                 self._lease = await self._read()
-                await self._ask(started)
+                await self._take_or_renew(started)
             self._failures = 0
         except Conflict:
             self._lose("another operator wrote the Lease")
         except ApiError as error:
-            # The time that the last renewal gave goes on; after that, ``is_leader`` is false.
+            # The last renewal stays valid.  When its time ends, ``is_leader`` becomes False.
             self.why = str(error)
             self._failures += 1
         return self._pause()
 
-    async def _ask(self, started: float) -> None:
+    async def _take_or_renew(self, started: float) -> None:
         if self._may_take(self._lease):
             self._lease = await self._write(
                 self._lease, holder=self._identity, seconds=int(self._seconds)
             )
             if not self._resigned:
-                self._asked, self.why = started, ""
+                self._renewed_at, self.why = started, ""
 
     def _pause(self) -> float:
         if self.is_leader and not self.why:
@@ -154,7 +171,7 @@ class LeaderElector:
         else:
             pause = RETRY_SHARE * self._seconds
         if self.is_leader:
-            # Not beyond the moment at which it lapses, so that it is told of in time.
+            # Wake up when the renewal expires, so that ``on_change`` is called in time.
             pause = min(pause, max(self._until - self._clock(), 0.0) + 0.001)
         return pause
 
@@ -169,22 +186,22 @@ class LeaderElector:
         holder = spec.get("holderIdentity") or ""
         if holder in ("", self._identity):
             return True
-        now, seen = self._clock(), (holder, spec.get("renewTime"), spec.get("leaseTransitions"))
-        if seen != self._seen:
-            self._seen, self._seen_at = seen, now
-        patience = spec.get("leaseDurationSeconds")
-        if not isinstance(patience, int) or patience <= 0:
-            patience = int(self._seconds)
-        patience = min(patience, LONGEST_PATIENCE * self._seconds)
-        if now - self._seen_at >= patience:
+        now, other = self._clock(), (holder, spec.get("renewTime"), spec.get("leaseTransitions"))
+        if other != self._other:
+            self._other, self._other_since = other, now
+        duration = spec.get("leaseDurationSeconds")
+        if not isinstance(duration, int) or duration <= 0:
+            duration = int(self._seconds)
+        duration = min(duration, LONGEST_DURATION * self._seconds)
+        if now - self._other_since >= duration:
             return True
-        self._lose(f"{holder} holds it")
+        self._lose(f"{holder} holds the Lease")
         return False
 
     async def _write(self, lease: Body | None, *, holder: str, seconds: int) -> Body:
         spec = _spec(lease)
         stamp = format_micro_time(self._wall_clock())
-        fresh = (spec.get("holderIdentity") or "") != self._identity
+        new_holder = (spec.get("holderIdentity") or "") != self._identity
         transitions = spec.get("leaseTransitions")
         turns = transitions if isinstance(transitions, int) else 0
         body: Body = {
@@ -194,32 +211,36 @@ class LeaderElector:
             "spec": {
                 "holderIdentity": holder,
                 "leaseDurationSeconds": seconds,
-                "acquireTime": stamp if fresh else spec.get("acquireTime", stamp),
+                "acquireTime": stamp if new_holder else spec.get("acquireTime", stamp),
                 "renewTime": stamp,
-                "leaseTransitions": turns + 1 if fresh and lease is not None else turns,
+                "leaseTransitions": turns + 1 if new_holder and lease is not None else turns,
             },
         }
         if lease is None:
             return await self._cluster.create(LEASES, self._namespace, body)
         version = lease["metadata"].get("resourceVersion")
         if not version:
-            # Without it another's Lease could be written over.
+            # Without it this write could replace the Lease of another process.
             raise Unavailable("the Lease has no resourceVersion")
         body["metadata"]["resourceVersion"] = version
         return await self._cluster.replace(LEASES, self._namespace, self._name, body)
 
     def _lose(self, why: str) -> None:
-        self._asked, self.why = float("-inf"), why
+        self._renewed_at, self.why = float("-inf"), why
 
-    def _tell(self) -> None:
-        if self.is_leader == self._told:
+    def _report(self) -> None:
+        if self.is_leader == self._reported:
             return
-        self._told = self.is_leader
-        if self._told:
-            log.info("this operator acts now", extra=about(reason="LeaseHeld"))
+        self._reported = self.is_leader
+        if self._reported:
+            log.info("this operator is the leader now", extra=about(reason="LeaseHeld"))
         else:
-            log.warning("this operator acts no more: %s", self.why, extra=about(reason="LeaseLost"))
-        self._on_change(self._told)
+            log.warning(
+                "this operator is the leader no longer: %s",
+                self.why,
+                extra=about(reason="LeaseLost"),
+            )
+        self._on_change(self._reported)
 
 
 def _spec(lease: Body | None) -> dict[str, Any]:
@@ -232,13 +253,16 @@ def _spec(lease: Body | None) -> dict[str, Any]:
 RENEW_SERVING = names.SERVING_SECONDS / 5
 """Seconds between two renewals."""
 RETRY_SERVING = 1.0
-"""Seconds until the next look where the namespace is not served yet."""
+"""Seconds until the next step in a namespace that is not served yet."""
 RETRY_REFUSED = 15.0
-"""Seconds until the next attempt where the Lease could not be written."""
+"""Seconds until the next attempt after the Lease could not be written."""
 
 
 class Heartbeat:
-    """Renews the Lease wherever ``serves`` says so.  ``namespaces`` are served; empty: all."""
+    """Writer of the Lease that shows programs that an operator serves ``namespaces`` (empty: all).
+
+    A Lease is renewed while ``serves`` returns True for its namespace (empty: all).
+    """
 
     def __init__(
         self,
@@ -249,25 +273,24 @@ class Heartbeat:
         serves: Callable[[str], bool],
         wall_clock: Callable[[], float] = time.time,
     ) -> None:
-        """``serves`` is called with a namespace, or with nothing (all namespaces)."""
         self._cluster = cluster
         self._namespaces = tuple(namespaces) or ("",)
         self._identity = identity
         self._serves = serves
         self._wall_clock = wall_clock
         self._failures: dict[str, str] = {}
-        """Namespace of a Lease -> why it cannot be written."""
+        """Errors of Leases that could not be written, by namespace."""
 
     async def run(self) -> None:
-        """Go on until cancelled."""
-        await asyncio.gather(*map(self._keep, self._namespaces))
+        """Renew the Leases until cancelled."""
+        await asyncio.gather(*map(self._keep_fresh, self._namespaces))
 
-    async def _keep(self, namespace: str) -> None:
+    async def _keep_fresh(self, namespace: str) -> None:
         while True:
             await asyncio.sleep(await self._step(namespace))
 
     async def _step(self, namespace: str) -> float:
-        """Renew the Lease if the namespace is served; returns the seconds until the next step."""
+        """Renew the Lease if the namespace is served.  Return the seconds until the next step."""
         if not self._serves(namespace):
             return RETRY_SERVING
         where = namespace or names.SERVING_NAMESPACE

@@ -1,4 +1,4 @@
-"""Process of the operator: its parts, put together.
+"""Process of the operator: makes its parts, connects and runs them.
 
 ::
 
@@ -23,20 +23,21 @@ from fiber_operator.cluster import WRITE_TIMEOUT, Cluster, Permit, load_configur
 from fiber_operator.controller import Controller
 from fiber_operator.creation import Draw, draw_suffix
 from fiber_operator.events import EventRecorder
-from fiber_operator.health import Health, serving
+from fiber_operator.health import Health, WatchStatus, serving
 from fiber_operator.informer import PodInformer
 from fiber_operator.lease_monitor import LeaseMonitor
 from fiber_operator.metrics import Metrics
 from fiber_operator.operator_leases import Heartbeat, LeaderElector
+from fiber_operator.resync import Resync
 from fiber_operator.settings import OperatorSettings
-from fiber_operator.watches import Configure, KopfThread, Resync, WatchStatus
+from fiber_operator.watches import Configure, KopfThread
 from fiber_operator.workqueue import Key, Result, WorkQueue
 
 log = logging.getLogger(__name__)
 
 
 DRAIN = 5.0
-"""Seconds that a call under way may take to end when the operator is to stop."""
+"""Seconds that running reconciles have to end when the operator stops."""
 
 
 class Part(Protocol):
@@ -46,7 +47,11 @@ class Part(Protocol):
 
 
 class OperatorProcess:
-    """Operator of one process.  ``watches`` makes the watches, which call ``notice``."""
+    """Operator of one process.
+
+    ``watches`` makes the part that watches pools and Leases.  ``now`` is the time of day, and
+    ``draw`` makes the random end of a pod's name.  Tests replace all three.
+    """
 
     def __init__(
         self,
@@ -59,23 +64,23 @@ class OperatorProcess:
     ) -> None:
         self._settings = settings
         self._configure = configure
-        self._watcher = watches
+        self._make_watches = watches
         self._now = now
         self._draw = draw
-        self._watched_before = False
+        self._kopf_started_before = False
         self.metrics = Metrics()
         self.port = 0
-        """Port of /healthz, once it is served."""
+        """Port of /healthz; 0 until it is served."""
 
     async def run(self, stop: asyncio.Event) -> None:
-        """Operate until ``stop``; then end what is under way and give up the Lease."""
+        """Operate until ``stop`` is set.  Then end running reconciles and give up the Lease."""
         settings = self._settings
         async with contextlib.AsyncExitStack() as stack:
             self._build(
                 await self._open(stack, settings.connections, permit=self._permit),
-                # For Leases alone, so that no queue of other calls keeps one from being renewed.
+                # Only for Leases, so that a renewal never waits behind other calls.
                 await self._open(stack, 2),
-                # For watches alone: each keeps a connection.
+                # Only for watches: each keeps a connection open.
                 await self._open(stack, 2 * max(1, len(settings.namespaces))),
             )
             self.port = await stack.enter_async_context(
@@ -156,13 +161,13 @@ class OperatorProcess:
         self.metrics.watch_queue(self.queue.statistics, lambda: self.elector.is_leader)
 
     async def _operate(self, stop: asyncio.Event) -> None:
-        watcher = self._watcher(
+        watcher = self._make_watches(
             self.notice,
             renewed=self._renewed,
             configure=self._configure,
             namespaces=self._settings.namespaces,
-            gate=self.resync.answered,
-            on_start=self._watching,
+            gate=self.resync.wait_until_served,
+            on_start=self._kopf_started,
             answered=self.watches.answered,
         )
         parts: list[Part] = [
@@ -181,7 +186,7 @@ class OperatorProcess:
             await asyncio.wait([*tasks, stopped], return_when=asyncio.FIRST_COMPLETED)
             self.elector.resign()
             await self.queue.drain(DRAIN)
-            # Before the watches are waited for: another operator may begin.
+            # Release the Lease before the slow end of the watches, so that another operator begins.
             tasks[0].cancel()
             await asyncio.wait([tasks[0]])
             await self.elector.release()
@@ -194,19 +199,19 @@ class OperatorProcess:
                 raise result
 
     def notice(self, key: Key, uid: str, generation: int) -> None:
-        """Reconcile a pool that was made, changed or deleted."""
+        """Reconcile a pool that was made, changed or deleted (generation -1)."""
         self.metrics.watched("fiberpools")
         if self.controller.is_news(key, uid, generation):
             self.queue.add(key, urgent=True)
 
     def _pods_changed(self, key: Key) -> None:
         self.metrics.watched("pods")
-        if all(key):  # else another program has set the labels
+        if all(key):  # a pod without these labels is of another program
             self.queue.add(key)
 
     def _renewed(self, namespace: str, lease: str, version: str, connected: int | None) -> None:
         self.metrics.watched("leases")
-        self.lease_monitor.heard(namespace, lease, version, connected)
+        self.lease_monitor.lease_changed(namespace, lease, version, connected)
 
     async def _reconcile(self, key: Key) -> Result:
         if not self.elector.is_leader:
@@ -216,17 +221,17 @@ class OperatorProcess:
     def _permit(self) -> float:
         return self.elector.require()
 
-    def _watching(self, running: bool) -> None:
-        if running and self._watched_before:
+    def _kopf_started(self, running: bool) -> None:
+        if running and self._kopf_started_before:
             self.metrics.watch_restarted()
-        self._watched_before = True
+        self._kopf_started_before = True
         self.watches.started(running)
 
     def _lease_changed(self, held: bool) -> None:
         self.controller.forget()
         if held:
             self.informer.refresh()
-            # What happened while another operator acted was not looked at.
+            # This operator has reconciled no pool while another was the leader.
             self.resync.poke()
             for key in self.queue.known():
                 self.queue.add(key)

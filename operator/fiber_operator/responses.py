@@ -22,7 +22,7 @@ import asyncio
 import codecs
 import json
 import re
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
 from typing import Any
 
 Body = dict[str, Any]
@@ -88,8 +88,12 @@ class Oversized(ApiError):
     """The object has so many values that it is not decoded: each takes memory."""
 
 
+Answered = Callable[[str, ApiError | None], None]
+"""Called with the answer to a list or watch: the request (``watch pods in team``) and its error."""
+
+
 def complaint(error: ApiError) -> str:
-    """Return the words of an error, and the remedy if it is known."""
+    """Return the text of an error, and the remedy if it is known."""
     if isinstance(error, Refused):
         return f"{error}. Give the operator's account this right: the chart's roles have it"
     return str(error)

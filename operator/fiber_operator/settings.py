@@ -1,6 +1,6 @@
 """Settings of the operator, from environment variables that begin with FIBER_OPERATOR_.
 
-An unknown name is an error, because a misspelt setting would otherwise be ignored in silence.
+An unknown name is an error.  Otherwise a misspelt setting would have no effect and no message.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from typing import Any
 
 PREFIX = "FIBER_OPERATOR_"
 
-# Kubernetes gives each container such variables for the Services of its namespace; one that is
-# called fiber-operator gives them our prefix.
+# Kubernetes sets variables for the Services of a namespace in each container.  Those of a Service
+# that is called fiber-operator have this prefix.
 _SERVICE_LINK = re.compile(r".*SERVICE_(HOST|PORT\w*)|(.*_)?PORT(_\d+_(TCP|UDP|SCTP)(_\w+)?)?")
 _OWN_NAMESPACE = Path("/var/run/secrets/kubernetes.io/serviceaccount/namespace")
 _DNS_LABEL = re.compile(r"[a-z0-9]([-a-z0-9]{0,61}[a-z0-9])?")
@@ -26,7 +26,7 @@ _LOG_FORMATS = ("json", "text")
 
 
 class SettingsError(ValueError):
-    """The environment does not make sense; the message names every variable that is wrong."""
+    """Error of settings.  The message names each variable that is wrong."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,50 +34,51 @@ class OperatorSettings:
     """Settings of this operator.  Times are in seconds."""
 
     namespaces: tuple[str, ...] = ()
-    """FIBER_OPERATOR_NAMESPACES: serve only these, separated by commas; empty: all of them."""
+    """FIBER_OPERATOR_NAMESPACES: namespaces to serve, separated by commas; empty: all."""
     namespace: str = "default"
-    """FIBER_OPERATOR_NAMESPACE: where the operator's own Lease is; its pod's if left out."""
+    """FIBER_OPERATOR_NAMESPACE: namespace of the leader's Lease.  Default: that of the pod."""
     identity: str = field(default_factory=lambda: f"{socket.gethostname()}-{uuid.uuid4().hex[:8]}")
-    """FIBER_OPERATOR_IDENTITY: holder of the Lease.  No two processes that may run at the same
-    time may share it; the name of the operator's pod is right, and lets a container that was
-    restarted go on at once."""
+    """FIBER_OPERATOR_IDENTITY: name of this process in the leader's Lease.  Two processes that run
+    at the same time must have different names.  With the name of the pod, a container that was
+    restarted becomes the leader at once."""
     lease: str = "fiber-operator"
-    """FIBER_OPERATOR_LEASE: what the operator's own Lease is called after.  Processes with the same
-    Lease are one release, of which one acts; with its namespace it says which release serves a
-    pool."""
+    """FIBER_OPERATOR_LEASE: name of the release, from which the leader's Lease gets its name.
+    Processes with the same Lease are one release and have one leader.  The name and the namespace
+    of the Lease also say which release serves a pool."""
     lease_seconds: int = 15
-    """FIBER_OPERATOR_LEASE_SECONDS: how long another process of the release waits for one
-    that is silent."""
+    """FIBER_OPERATOR_LEASE_SECONDS: seconds without a renewal after which another process of the
+    release may become the leader."""
     host: str = ""
+    """FIBER_OPERATOR_LISTEN, its address; empty: all addresses."""
     port: int = 8080
-    """FIBER_OPERATOR_LISTEN: ``address:port`` of /healthz, /readyz and /metrics."""
+    """FIBER_OPERATOR_LISTEN, its port: ``address:port`` of /healthz, /readyz and /metrics."""
     resync_seconds: float = 60.0
-    """FIBER_OPERATOR_RESYNC_SECONDS: each pool is looked at this often though nothing happened."""
+    """FIBER_OPERATOR_RESYNC_SECONDS: seconds after which a pool is reconciled without an event."""
     concurrency: int = 8
-    """FIBER_OPERATOR_CONCURRENCY: pools that are worked on at the same time."""
+    """FIBER_OPERATOR_CONCURRENCY: pools that are reconciled at the same time."""
     connections: int = 32
-    """FIBER_OPERATOR_CONNECTIONS: connections to the API server, watches not included."""
+    """FIBER_OPERATOR_CONNECTIONS: connections to the API server, without watches."""
     cpu_request: str = "50m"
-    """FIBER_OPERATOR_CPU_REQUEST: what a worker requests where neither the template nor the program
-    says anything, as a quantity of Kubernetes; empty: nothing."""
+    """FIBER_OPERATOR_CPU_REQUEST: request of a worker if neither the template nor the program gives
+    one, as a quantity of Kubernetes; empty: no request."""
     memory_request: str = "64Mi"
-    """FIBER_OPERATOR_MEMORY_REQUEST: the same of memory."""
+    """FIBER_OPERATOR_MEMORY_REQUEST: the same for memory."""
     log_level: str = "INFO"
     """FIBER_OPERATOR_LOG_LEVEL: DEBUG, INFO, WARNING or ERROR."""
     log_format: str = "json"
-    """FIBER_OPERATOR_LOG_FORMAT: json, or text for people."""
+    """FIBER_OPERATOR_LOG_FORMAT: json, or text."""
 
     @property
     def requests(self) -> dict[str, str]:
-        """Default requests of a worker, for resources that its template does not mention."""
-        asked = {"cpu": self.cpu_request, "memory": self.memory_request}
-        return {kind: amount for kind, amount in asked.items() if amount}
+        """Return the default requests of a worker for resources that its template does not name."""
+        requests = {"cpu": self.cpu_request, "memory": self.memory_request}
+        return {resource: quantity for resource, quantity in requests.items() if quantity}
 
     @classmethod
     def from_environment(
         cls, environment: Mapping[str, str], own_namespace: Path = _OWN_NAMESPACE
     ) -> OperatorSettings:
-        """Read the settings.  Raises SettingsError that names all that is wrong at once."""
+        """Read the settings.  Raises SettingsError, which names all wrong variables at once."""
         given = {
             name.removeprefix(PREFIX): value.strip()
             for name, value in environment.items()
@@ -92,7 +93,7 @@ class OperatorSettings:
                 values.update(_READERS[name](value))
             except KeyError:
                 known = ", ".join(sorted(PREFIX + known for known in _READERS))
-                wrong.append(f"{PREFIX}{name} is no setting; there are {known}")
+                wrong.append(f"{PREFIX}{name} is not a setting. The settings are {known}")
             except ValueError as error:
                 wrong.append(f"{PREFIX}{name}={value!r}: {error}")
         if wrong:
@@ -117,7 +118,9 @@ def _names(value: str) -> tuple[str, ...]:
 
 def _identity(value: str) -> str:
     if not value:
-        raise ValueError("must not be empty: leave it out, or give the name of the operator's pod")
+        raise ValueError(
+            "must not be empty: remove it, or set it to the name of the operator's pod"
+        )
     return value
 
 
@@ -157,7 +160,7 @@ _READERS: dict[str, Callable[[str], dict[str, Any]]] = {
     "NAMESPACE": _reader("namespace", _name),
     "IDENTITY": _reader("identity", _identity),
     "LEASE": _reader("lease", _name),
-    # Shorter ones would be lost by one slow answer of the API server.
+    # One slow answer of the API server would end a shorter Lease.
     "LEASE_SECONDS": _reader("lease_seconds", _whole(6, 3600)),
     "LISTEN": _address,
     "RESYNC_SECONDS": _reader("resync_seconds", _whole(5, 3600)),

@@ -1,9 +1,8 @@
 """``python -m fiber_operator.smoke MANIFEST``: check that this cluster turns a FiberPool into pods.
 
-``helm test`` runs this.  It creates the FiberPool of MANIFEST (a JSON document), waits until the
-pool is ready and deletes it, also when it is interrupted.  The pool's name belongs to the test: a
-pool of that name from an earlier test is deleted first.  The exit status is 0, or 1 with a message
-that says what is wrong.
+``helm test`` runs this.  The test creates the FiberPool of MANIFEST (a JSON document), waits until
+the pool is ready, and deletes it, even if the test is interrupted.  A pool of that name from an
+earlier test is deleted first.  The exit status is 0, or 1 with a message that names the problem.
 """
 
 from __future__ import annotations
@@ -20,11 +19,11 @@ from fiber_operator.cluster import POOLS, Cluster, load_configuration
 from fiber_operator.responses import ApiError, Conflict, Gone, Unavailable
 
 PATIENCE = 240.0
-"""Seconds for the worker to become ready: less than `helm test` itself waits by default."""
+"""Seconds for each step.  `helm test` waits longer by default."""
 TOLERANCE = 30.0
-"""Seconds that the pool may be degraded: a registry may fail once, but not all the time."""
+"""Seconds for which the pool may be degraded.  A registry, for example, may fail once."""
 PAUSE = 0.5
-"""Seconds between two looks at the pool."""
+"""Seconds between two reads of the pool."""
 
 UNSEEN = "the operator has not looked at the pool yet"
 
@@ -32,11 +31,11 @@ Pool = Mapping[str, Any]
 
 
 class Failed(Exception):
-    """The pool did not become ready; the message says why and what to do."""
+    """Failure of the test.  The message says what happened and what to do."""
 
 
 class Smoke:
-    """Smoke test.  ``say`` is called with lines about its progress."""
+    """Test that a pool becomes ready.  ``say`` is called with each line about the progress."""
 
     def __init__(
         self,
@@ -56,31 +55,32 @@ class Smoke:
         self._patience = patience
         self._tolerance = tolerance
         self._pause = pause
-        self._last = "nothing"
+        self._last = "no answer of the API server"
+        """State that was seen last."""
 
     async def run(self) -> None:
-        """Make the pool, wait, delete it.  Raises Failed."""
-        await self._in_time(self._remove(), "an earlier test's pool could not be deleted")
+        """Create the pool, wait until it is ready, and delete it.  Raises Failed."""
+        await self._within_patience(self._remove(), "an earlier test's pool could not be deleted")
         try:
-            await self._in_time(self._create(), "the pool could not be made")
+            await self._within_patience(self._create(), "the pool could not be made")
             self._say(f"made the FiberPool {self._name} in namespace {self._namespace}")
-            await self._in_time(self._until_ready(), "its worker did not become ready")
+            await self._within_patience(self._until_ready(), "its worker did not become ready")
         finally:
-            await self._in_time(self._remove(), "the pool could not be deleted")
+            await self._within_patience(self._remove(), "the pool could not be deleted")
         self._say("deleted it: this cluster runs FiberPools")
 
-    async def _in_time(self, step: Coroutine[Any, Any, None], otherwise: str) -> None:
+    async def _within_patience(self, step: Coroutine[Any, Any, None], failure: str) -> None:
         try:
             async with asyncio.timeout(self._patience):
                 await step
         except TimeoutError:
-            why = f"{otherwise} in {self._patience:g} s. Last seen: {self._last}"
+            message = f"{failure} in {self._patience:g} s. Last seen: {self._last}"
             if self._last == UNSEEN:
-                why += (
-                    f". It does not run, or does not watch the namespace {self._namespace}: see "
-                    "the operator's log"
+                message += (
+                    ". The operator does not run, or does not watch the namespace "
+                    f"{self._namespace}: see its log"
                 )
-            raise Failed(why) from None
+            raise Failed(message) from None
 
     async def _create(self) -> None:
         while True:
@@ -93,7 +93,7 @@ class Smoke:
                     "crds.install=true."
                 ) from error
             except Conflict:
-                return  # An earlier attempt was carried out, though its answer was lost.
+                return  # an earlier attempt succeeded, and its answer was lost
             except Unavailable as error:
                 await self._wait(str(error))
             except ApiError as error:
@@ -103,17 +103,19 @@ class Smoke:
 
     async def _until_ready(self) -> None:
         clock = asyncio.get_running_loop().time
-        well = clock()
+        last_healthy = clock()
         while True:
             pool = await self._read()
             if pool is None:
-                raise Failed("somebody else deleted the pool while its worker started; try again")
+                raise Failed(
+                    "another client deleted the pool while its worker started. Run the test again"
+                )
             if is_ready(pool):
                 self._say("its worker is ready")
                 return
             if not is_degraded(pool):
-                well = clock()
-            if hopeless(pool) or clock() - well > self._tolerance:
+                last_healthy = clock()
+            if is_hopeless(pool) or clock() - last_healthy > self._tolerance:
                 raise Failed(f"its worker does not start. {problems(pool)}")
             await self._wait(state(pool), problems(pool))
 
@@ -125,7 +127,7 @@ class Smoke:
                         POOLS, self._namespace, self._name, uid=pool["metadata"]["uid"]
                     )
                 except (Gone, Conflict):
-                    continue  # Somebody was quicker: look again.
+                    continue  # another client deleted it: read it again
                 except Unavailable as error:
                     self._last = str(error)
             await self._wait("the pool is being deleted")
@@ -142,7 +144,7 @@ class Smoke:
                 raise Failed(f"the API server does not show the pool: {error}") from error
 
     async def _wait(self, seen: str, details: str = "") -> None:
-        """Let time pass; the details are told when what is seen changes, not each time they do."""
+        """Wait ``_pause`` seconds.  Print the details only when ``seen`` has changed."""
         if seen != self._last:
             self._last = seen
             self._say(f"{seen}. {details}" if details else seen)
@@ -150,17 +152,17 @@ class Smoke:
 
 
 def is_ready(pool: Pool) -> bool:
-    """Tell whether the operator reports Ready for the present spec of the pool."""
+    """Return True if the operator reports Ready for the current spec of the pool."""
     return _is_true(pool, ConditionType.READY)
 
 
 def is_degraded(pool: Pool) -> bool:
-    """Tell whether a problem is reported, which may pass."""
+    """Return True if the operator reports a problem."""
     return _is_true(pool, ConditionType.DEGRADED)
 
 
-def hopeless(pool: Pool) -> bool:
-    """Tell whether there is a problem that waiting cannot help."""
+def is_hopeless(pool: Pool) -> bool:
+    """Return True if a problem is reported that does not end by waiting."""
     return any(problem.get("terminal") for problem in _problems(pool))
 
 
@@ -174,7 +176,7 @@ def state(pool: Pool) -> str:
 
 
 def problems(pool: Pool) -> str:
-    """Return the problems and what to do, in the operator's words."""
+    """Return the operator's messages about the problems."""
     return " ".join(str(problem.get("message")) for problem in _problems(pool))
 
 
@@ -193,7 +195,7 @@ def _problems(pool: Pool) -> list[dict[str, Any]]:
 async def _main(manifest: dict[str, Any]) -> None:
     loop, task = asyncio.get_running_loop(), asyncio.current_task()
     assert task is not None
-    # Kubernetes' way to interrupt; asyncio.run does the same for Ctrl-C.
+    # Kubernetes sends SIGTERM.  asyncio.run cancels the task on Ctrl-C in the same way.
     loop.add_signal_handler(signal.SIGTERM, task.cancel)
     cluster = Cluster(await load_configuration(), connections=1)
     try:

@@ -8,13 +8,13 @@ reconciles of one pool:
   growing pool cause a few reconciles;
 * a failed reconcile is repeated after a delay that doubles each time.
 
-While a pool changes, it is also reconciled when the events of its pods cease, even if it has not
-rested: the status then shows the result at once.  The next rest is longer by the part that was
-skipped, and is not shortened again.
+A pool whose result says ``early`` may be reconciled before the end of its rest, as soon as the
+events of its pods pause.  So the status shows the end of a change at once.  The next rest is longer
+by the time that was saved, and cannot be shortened, so that the load stays the same.
 
-A pool in trouble does not hold up others.  A reconcile that takes longer than ``LONG`` seconds, for
-example because a webhook hangs, passes its place to the next pool.  Pools whose last reconcile
-failed let others go first and never occupy all places.
+A pool in trouble does not delay others.  A reconcile that takes longer than ``LONG`` seconds, for
+example because a webhook hangs, gives its place to the next pool and goes on.  Pools whose last
+reconcile failed come after the others and never occupy all places.
 
 Namespaces take turns: the next pool comes from the namespace with the fewest running reconciles,
 and among those from the one whose last reconcile began first.  A namespace without a running
@@ -40,26 +40,26 @@ log = logging.getLogger(__name__)
 
 
 GAP = 0.5
-"""Seconds between reconciles that only pods' events asked for: they show in the status within a
-second, and a pool that grows by fifty pods a second costs two lists a second."""
-LULL = 0.15
-"""Seconds without an event after which the events of a pool have ceased."""
+"""Seconds between reconciles that are caused by events of pods: short enough that the status is
+current within a second, long enough that many events cause one reconcile."""
+PAUSE = 0.15
+"""Seconds without an event after which the events of a pool have paused."""
 FIRST_BACKOFF = 0.5
 LONGEST_BACKOFF = 30.0
 LONGEST_BLOCK = 1.0
-"""Seconds for which a failure keeps even new events out."""
+"""Seconds, at most, for which even urgent events wait after a failed reconcile."""
 
 LONG = 2.0
-"""Seconds after which a reconcile counts as waiting and not as working."""
+"""Seconds after which a running reconcile gives its place to another."""
 YIELD = 10.0
-"""Seconds by which a pool whose last reconcile failed lets others go first."""
-CROWD = 4
-"""Reconciles under way at most, those that wait included, for each that may work."""
+"""Seconds for which a due pool whose last reconcile failed lets others go first."""
+MOST_RUNNING = 4
+"""Running reconciles at most for each place, including those that gave up their place."""
 
 
 _Heap = list[tuple[float, int, "Key"]]
 _Heaps = dict[str, _Heap]
-"""Heaps by namespace."""
+"""Heap of due times for each namespace."""
 
 
 class Key(NamedTuple):
@@ -76,93 +76,101 @@ class Result:
     requeue_after: float | None = None
     """Reconcile again after this many seconds even without an event."""
     rest: float = 0.0
-    """Do not reconcile again for this many seconds in any case."""
-    lull: bool = False
-    """Reconcile again, even before it has rested, when events of its pods have come and cease."""
+    """Do not reconcile again for this many seconds, even for urgent events."""
+    early: bool = False
+    """Reconcile before the end of the rest if events of pods arrive and then pause."""
     failed: bool = False
-    """Reconcile again soon, and later each time."""
+    """Reconcile again after a delay that doubles with each failure."""
     forget: bool = False
-    """True if the pool does not exist."""
+    """Remove the pool from the queue, because it does not exist."""
 
 
 @dataclass
 class _Entry:
+    """State of one pool in the queue."""
+
     due: float | None = None
-    """Time at which it is due; None: it does not wait."""
-    blocked: float = -1e9
-    """Earliest time of the next reconcile."""
-    rested: float = -1e9
-    """End of the pool's rest, when events of its pods bring a reconcile."""
-    lull: bool = False
-    """True if they bring it before the end of the rest, once they cease."""
-    limit: float | None = None
-    """Latest time of a reconcile that waits for the events to cease; None if none waits."""
-    owed: float = 0.0
-    """Seconds by which its last rest was shortened."""
+    """Time of the next reconcile; None: none is asked for."""
+    blocked_until: float = -1e9
+    """Earliest time of a reconcile for an urgent event."""
+    resting_until: float = -1e9
+    """Earliest time of a reconcile for events of pods, unless ``may_be_early``."""
+    may_be_early: bool = False
+    """True if a pause of the events ends the rest."""
+    latest: float | None = None
+    """Latest time of a reconcile that waits for a pause of the events; None: none waits for one."""
+    rest_saved: float = 0.0
+    """Seconds by which a pause shortened the last rest.  The next rest is longer by them."""
     failures: int = 0
-    running: float | None = None
-    """Time at which its present reconcile began; None while none runs."""
-    rush: bool = False
-    """True if it was added urgently while it ran."""
+    """Reconciles that failed one after the other."""
+    running_since: float | None = None
+    """Time at which the running reconcile began; None: none runs."""
+    urgent: bool = False
+    """True if an urgent event arrived while the reconcile ran."""
     order: int = -1
-    """Order of its valid place in the heap.  Places with other orders are void."""
+    """Number of the valid entry of this pool in the heap.  Entries with other numbers are void."""
 
 
 @dataclass(frozen=True)
 class QueueStatistics:
-    """The queue at one moment."""
+    """Numbers of the queue at one moment."""
 
     waiting: int
-    """Pools that are due and wait for a free task."""
+    """Pools that are due and wait for a place."""
     running: int
+    """Running reconciles."""
     known: int
+    """Pools that were added and still exist."""
     longest_wait: float
     """Seconds for which the pool that waits longest is overdue."""
     longest_run: float
-    """Seconds that the longest reconcile takes so far."""
+    """Seconds since the oldest running reconcile began."""
     since_last_end: float
-    """Seconds since a reconcile ended, or since the queue was made."""
+    """Seconds since the last end of a reconcile, or since the queue was made."""
 
 
 class WorkQueue:
-    """Reconciles each pool in its time.  ``reconcile`` is awaited once at a time for a pool."""
+    """Queue that awaits ``reconcile`` for each pool that was added, one at a time for each pool.
+
+    ``concurrency`` is the number of places, which pools of all namespaces share.
+    """
 
     def __init__(self, reconcile: Callable[[Key], Awaitable[Result]], *, concurrency: int) -> None:
         self._reconcile = reconcile
         self._concurrency = concurrency
         self._entries: dict[Key, _Entry] = {}
-        self._well: _Heaps = {}
+        self._healthy: _Heaps = {}
         self._failing: _Heaps = {}
         self._last_begun: dict[str, int] = {}
-        """Order of the last reconcile of each namespace."""
+        """Number of the last reconcile of each namespace, from ``_orders``."""
         self._orders = itertools.count()
         self._tasks: dict[asyncio.Task[None], tuple[float, str]] = {}
-        """Reconciles under way, the oldest first: since when, and the namespace."""
+        """Running reconciles, the oldest first: time of the begin, and namespace."""
         self._wake = asyncio.Event()
         self._last_end = self._now()
 
     def add(self, key: Key, *, delay: float = 0.0, urgent: bool = False) -> None:
-        """Reconcile ``key``: after ``delay`` seconds, ``GAP`` after its last, or if urgent now.
+        """Reconcile ``key`` after ``delay`` seconds, and after its rest.  If urgent, skip the rest.
 
-        A reconcile that it waits for already is brought forward if need be, never put off.
+        If the pool already waits, the earlier of both times counts.
         """
         now = self._now()
         entry = self._entries.setdefault(key, _Entry())
-        if not urgent and entry.lull and entry.running is None:
-            self._await_lull(key, entry, now + delay)
+        if not urgent and entry.may_be_early and entry.running_since is None:
+            self._wait_for_pause(key, entry, now + delay)
             return
-        due = max(now + delay, entry.blocked)
+        due = max(now + delay, entry.blocked_until)
         if not urgent:
-            due = max(due, entry.rested)
-        elif entry.running is not None:
-            entry.rush = True
-        if entry.limit is not None:
-            entry.limit = min(entry.limit, due)
+            due = max(due, entry.resting_until)
+        elif entry.running_since is not None:
+            entry.urgent = True
+        if entry.latest is not None:
+            entry.latest = min(entry.latest, due)
         if entry.due is None or due < entry.due:
             self._place(key, entry, due)
 
     async def run(self) -> None:
-        """Reconcile what is due until cancelled; then end what is under way."""
+        """Reconcile the pools that are due until cancelled.  Then cancel the running reconciles."""
         try:
             while True:
                 self._wake.clear()
@@ -174,21 +182,23 @@ class WorkQueue:
             await asyncio.gather(*self._tasks, return_exceptions=True)
 
     async def drain(self, grace: float) -> None:
-        """Start no further reconcile, and give those under way ``grace`` seconds to end."""
+        """Start no further reconcile.  Wait ``grace`` seconds for the running ones to end."""
         self._concurrency = 0
         if self._tasks:
             await asyncio.wait(self._tasks, timeout=grace)
 
     def statistics(self) -> QueueStatistics:
-        """The queue now."""
+        """Return the numbers of the queue now."""
         now = self._now()
         overdue = [
             now - entry.due
             for entry in self._entries.values()
-            if entry.due is not None and entry.due <= now and entry.running is None
+            if entry.due is not None and entry.due <= now and entry.running_since is None
         ]
         runs = [
-            now - entry.running for entry in self._entries.values() if entry.running is not None
+            now - entry.running_since
+            for entry in self._entries.values()
+            if entry.running_since is not None
         ]
         return QueueStatistics(
             waiting=len(overdue),
@@ -200,29 +210,30 @@ class WorkQueue:
         )
 
     def known(self) -> list[Key]:
-        """Return every pool that was added and was not found to be gone."""
+        """Return the pools that were added and that no result has removed."""
         return list(self._entries)
 
     def _now(self) -> float:
         return asyncio.get_running_loop().time()
 
-    def _await_lull(self, key: Key, entry: _Entry, now: float) -> None:
-        if entry.limit is None:
-            rested = max(now, entry.rested)
-            entry.limit = rested if entry.due is None else min(rested, entry.due)
-        due = min(entry.limit, now + LULL)
+    def _wait_for_pause(self, key: Key, entry: _Entry, event_at: float) -> None:
+        """Reconcile when the events pause: each event puts the reconcile off, up to a limit."""
+        if entry.latest is None:
+            rest_ends = max(event_at, entry.resting_until)
+            entry.latest = rest_ends if entry.due is None else min(rest_ends, entry.due)
+        due = min(entry.latest, event_at + PAUSE)
         if due != entry.due:
             self._place(key, entry, due)
 
     def _place(self, key: Key, entry: _Entry, due: float) -> None:
         entry.due, entry.order = due, next(self._orders)
-        if entry.running is None:
-            heaps = self._failing if entry.failures else self._well
+        if entry.running_since is None:
+            heaps = self._failing if entry.failures else self._healthy
             heapq.heappush(heaps.setdefault(key.namespace, []), (due, entry.order, key))
             self._wake.set()
 
     def _first(self, heaps: _Heaps, namespace: str) -> tuple[float, Key] | None:
-        """Return the first place in the namespace's heap that is not void."""
+        """Return the due time and the pool of the first valid entry in the namespace's heap."""
         heap = heaps[namespace]
         while heap:
             due, order, key = heap[0]
@@ -233,51 +244,54 @@ class WorkQueue:
         del heaps[namespace]
         return None
 
-    def _firsts(self) -> Iterator[tuple[float, _Heaps, str]]:
-        """Yield the due time and the place of the first pool of each namespace that may begin."""
-        under_way = Counter(namespace for _, namespace in self._tasks.values())
-        everywhere, alone = self._open(self._concurrency), self._open(2 * self._concurrency)
-        for heaps in alone:
+    def _candidates(self) -> Iterator[tuple[float, _Heaps, str]]:
+        """Yield due time, heaps and namespace of each namespace's first pool that may begin."""
+        running = Counter(namespace for _, namespace in self._tasks.values())
+        shared = self._open_heaps(self._concurrency)
+        extra = self._open_heaps(2 * self._concurrency)
+        for heaps in extra:
             for namespace in list(heaps):
-                if heaps not in everywhere and under_way[namespace]:
-                    continue
+                if heaps not in shared and running[namespace]:
+                    continue  # the extra places are for namespaces without a running reconcile
                 if first := self._first(heaps, namespace):
                     yield first[0], heaps, namespace
 
-    def _open(self, most: int) -> list[_Heaps]:
-        """Return the heaps whose pools may begin now, if ``most`` may work at the same time."""
+    def _open_heaps(self, places: int) -> list[_Heaps]:
+        """Return the heaps whose pools may begin now, if there are that many places."""
         now = self._now()
         working = sum(started + LONG > now for started, _ in self._tasks.values())
-        if working >= most or len(self._tasks) >= CROWD * most:
+        running = len(self._tasks)
+        if working >= places or running >= MOST_RUNNING * places:
             return []
-        if working >= max(1, most - most // 4) or len(self._tasks) >= (CROWD - 1) * most:
-            return [self._well]
-        return [self._well, self._failing]
+        if working >= max(1, places - places // 4) or running >= (MOST_RUNNING - 1) * places:
+            return [self._healthy]
+        return [self._healthy, self._failing]
 
     def _next(self) -> tuple[_Heaps, str] | None:
-        """Return the place of the next pool."""
+        """Return the heaps and the namespace of the pool to reconcile next."""
         now = self._now()
-        under_way = Counter(namespace for _, namespace in self._tasks.values())
+        running = Counter(namespace for _, namespace in self._tasks.values())
         turns = []
-        for due, heaps, namespace in self._firsts():
-            late = due + (YIELD if heaps is self._failing else 0.0) > now
+        for due, heaps, namespace in self._candidates():
+            yields = due + (YIELD if heaps is self._failing else 0.0) > now
             if due <= now:
-                turn = (late, under_way[namespace], self._last_begun.get(namespace, -1), due)
+                turn = (yields, running[namespace], self._last_begun.get(namespace, -1), due)
                 turns.append((turn, heaps, namespace))
         if not turns:
             return None
-        _, heaps, namespace = min(turns, key=lambda found: found[0])
+        _, heaps, namespace = min(turns, key=lambda candidate: candidate[0])
         return heaps, namespace
 
     def _start_due(self) -> None:
-        while found := self._next():
-            heaps, namespace = found
+        while chosen := self._next():
+            heaps, namespace = chosen
             now, (_, _, key) = self._now(), heapq.heappop(heaps[namespace])
             entry = self._entries[key]
-            entry.owed = max(0.0, entry.rested - now) if entry.limit is not None else 0.0
-            entry.due, entry.limit, entry.order = None, None, -1
-            entry.running, entry.rush, entry.lull = now, False, False
-            task = asyncio.create_task(self._take(key, entry), name=f"reconcile of {key}")
+            paused = entry.latest is not None
+            entry.rest_saved = max(0.0, entry.resting_until - now) if paused else 0.0
+            entry.due, entry.latest, entry.order = None, None, -1
+            entry.running_since, entry.urgent, entry.may_be_early = now, False, False
+            task = asyncio.create_task(self._run_reconcile(key, entry), name=f"reconcile of {key}")
             self._tasks[task] = now, namespace
             self._last_begun[namespace] = next(self._orders)
             task.add_done_callback(self._done)
@@ -287,51 +301,52 @@ class WorkQueue:
         self._wake.set()
 
     async def _sleep(self) -> None:
-        """Wait until a pool is due, a place becomes free, or a pool is added."""
+        """Wait until a pool is due, a reconcile gives up its place, or ``_wake`` is set."""
         now = self._now()
-        firsts = [due for due, _, _ in self._firsts()]
-        begun = [started for started, _ in self._tasks.values()]
-        handing_on = [started + LONG for started in begun if started + LONG > now]
+        due_times = [due for due, _, _ in self._candidates()]
+        long_from = [started + LONG for started, _ in self._tasks.values()]
+        next_place = [moment for moment in long_from if moment > now]
         timeout = None
-        if self._concurrency and (times := firsts + handing_on):
+        if self._concurrency and (times := due_times + next_place):
             timeout = max(0.0, min(times) - now)
         try:
             async with asyncio.timeout(timeout):
                 await self._wake.wait()
         except TimeoutError:
-            pass  # it is time
+            pass  # a pool is due, or a place is free
 
-    async def _take(self, key: Key, entry: _Entry) -> None:
+    async def _run_reconcile(self, key: Key, entry: _Entry) -> None:
         try:
             result = await self._reconcile(key)
         except Exception:
-            # A fault of this program must not end it: other pools work, and this one may again.
+            # A bug must not end the operator: other pools work, and this one may work again.
             log.exception("a reconcile failed", extra=about(*key, reason="InternalError"))
             result = Result(failed=True)
         finally:
-            entry.running, self._last_end = None, self._now()
-        self._settle(key, entry, result, self._last_end)
+            entry.running_since, self._last_end = None, self._now()
+        self._plan_next(key, entry, result, self._last_end)
 
-    def _settle(self, key: Key, entry: _Entry, result: Result, now: float) -> None:
-        wanted = entry.due is not None  # added while it ran
-        if result.forget and not wanted:
+    def _plan_next(self, key: Key, entry: _Entry, result: Result, now: float) -> None:
+        added_meanwhile = entry.due is not None
+        if result.forget and not added_meanwhile:
             del self._entries[key]
             if all(other.namespace != key.namespace for other in self._entries):
                 self._last_begun.pop(key.namespace, None)
             return
         entry.failures = entry.failures + 1 if result.failed else 0
-        entry.blocked = now + result.rest
+        entry.blocked_until = now + result.rest
         again = result.requeue_after
         if result.failed:
             again = min(LONGEST_BACKOFF, FIRST_BACKOFF * 2 ** min(entry.failures - 1, 10))
-            entry.blocked = max(entry.blocked, now + min(again, LONGEST_BLOCK))
-        entry.rested = max(now + GAP, entry.blocked) + entry.owed
-        entry.lull = result.lull and not result.failed and not entry.owed
+            entry.blocked_until = max(entry.blocked_until, now + min(again, LONGEST_BLOCK))
+        entry.resting_until = max(now + GAP, entry.blocked_until) + entry.rest_saved
+        entry.may_be_early = result.early and not result.failed and not entry.rest_saved
         if entry.due is not None:
             due, entry.due = entry.due, None
-            if entry.lull and not entry.rush:
-                self._await_lull(key, entry, max(due, now))
+            if entry.may_be_early and not entry.urgent:
+                self._wait_for_pause(key, entry, max(due, now))
             else:
-                self._place(key, entry, max(due, entry.blocked if entry.rush else entry.rested))
+                earliest = entry.blocked_until if entry.urgent else entry.resting_until
+                self._place(key, entry, max(due, earliest))
         if again is not None:
             self.add(key, delay=again, urgent=True)

@@ -152,7 +152,7 @@ def test_metrics_reach_the_monitoring(pool: Pool, agent: Body, release: Release)
 
 
 def _is_waiting(release: Release) -> bool:
-    """Return whether a second operator runs and says that it does not act."""
+    """Return whether a second operator runs and says that another is the leader."""
     pods = release.pods()
     if len(pods) != 2:
         return False
@@ -160,5 +160,5 @@ def _is_waiting(release: Release) -> bool:
     try:
         release.page("readyz", newest)
     except Refused as refused:
-        return "holds it" in refused.message
+        return "holds the Lease" in refused.message
     return False

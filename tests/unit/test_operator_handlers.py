@@ -380,8 +380,8 @@ def test_a_fault_of_ours_holds_up_no_other_event() -> None:
             gate=lambda: asyncio.sleep(0),
             on_start=lambda _: None,
         )
-        watcher._loop = asyncio.get_running_loop()
-        tell = functools.partial(watcher._tell, notice)
+        watcher._kopf_loop = asyncio.get_running_loop()
+        tell = functools.partial(watcher._add_event, notice)
         for pair in (("bad", "good"), ("bad", "again")):
             for what in pair:
                 tell(what)
@@ -439,5 +439,5 @@ def test_a_kopf_that_does_not_end_is_ended(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_patience_never_ends() -> None:
-    delays = iter(watches._Patience())
+    delays = iter(watches._EndlessDelays())
     assert max(itertools.islice(delays, 10_000)) == 5

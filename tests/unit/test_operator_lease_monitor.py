@@ -47,7 +47,9 @@ class Watch:
                 gone = change.type == "DELETED"
                 if not self.deaf and not self.api.down:
                     version = "" if gone else change.object["metadata"]["resourceVersion"]
-                    self.monitor.heard(namespace, name, version, connected_in(change.object))
+                    self.monitor.lease_changed(
+                        namespace, name, version, connected_in(change.object)
+                    )
             seen = len(changes)
             await self.store.changed()
 

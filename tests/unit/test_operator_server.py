@@ -21,10 +21,9 @@ from prometheus_client.parser import text_string_to_metric_families
 from fakes import virtual_time
 from fakes.kubernetes_api import Fault
 from fakes.world import NAMESPACE, OWN_LEASE, Test, World, a_world
-from fiber_operator.health import Health
+from fiber_operator.health import Health, WatchStatus
 from fiber_operator.metrics import Metrics, PoolSample
 from fiber_operator.planning.pods import PodState
-from fiber_operator.watches import WatchStatus
 from fiber_operator.workqueue import QueueStatistics
 from patience import PATIENCE
 
@@ -74,7 +73,7 @@ async def test_one_that_waits_for_the_lease_is_alive_and_not_ready(world: World)
     await world.settled(20)
     assert await ask(world, "/healthz") == (200, "ok")
     status, text = await ask(world, "/readyz")
-    assert (status, text) == (503, "this operator does not act: another holds it")
+    assert (status, text) == (503, "this operator is not the leader: another holds the Lease")
 
 
 @played
@@ -137,13 +136,15 @@ def test_all_is_well() -> None:
 
 def test_a_turn_that_hangs_is_a_reason_for_a_restart() -> None:
     assert Parts(longest_run=599.0).health.alive() == []
-    assert Parts(longest_run=601.0).health.alive() == ["the reconcile of a pool takes 601 s so far"]
+    assert Parts(longest_run=601.0).health.alive() == [
+        "the reconcile of a pool has taken 601 s so far"
+    ]
 
 
 def test_a_queue_that_stands_still_is() -> None:
     assert Parts(longest_wait=500.0, since_last_end=10.0).health.alive() == []
     (said,) = Parts(longest_wait=130.0, since_last_end=140.0).health.alive()
-    assert said == "no reconcile has ended for 140 s, and pools wait"
+    assert said == "pools wait, and no reconcile has ended for 140 s"
 
 
 def test_a_resync_that_stands_still_is() -> None:
@@ -152,7 +153,7 @@ def test_a_resync_that_stands_still_is() -> None:
     assert parts.health.alive() == []
     parts.now += 20
     (said,) = parts.health.alive()
-    assert said == "the pools were not even tried to be listed for 250 s"
+    assert said == "the operator has not tried to list the pools for 250 s"
 
 
 def test_a_resync_that_never_began_is() -> None:
@@ -164,10 +165,10 @@ def test_a_resync_that_never_began_is() -> None:
 
 
 def test_pools_that_wait_or_are_not_watched_are_not_served() -> None:
-    assert Parts(longest_wait=31.0).health.ready() == ["a pool waits for its reconcile for 31 s"]
+    assert Parts(longest_wait=31.0).health.ready() == ["a pool has waited 31 s for its reconcile"]
     parts = Parts()
     parts.watches.started(False)
-    assert parts.health.ready() == ["nothing is watched: changes are seen late"]
+    assert parts.health.ready() == ["kopf does not run: changes are seen late"]
 
 
 @played
@@ -317,7 +318,7 @@ def test_the_process_refuses_settings_that_make_no_sense(tmp_path: Path) -> None
         timeout=PATIENCE,
     )
     assert done.returncode == 2
-    assert "fiber_operator: FIBER_OPERATOR_NAMESPCES is no setting" in done.stderr
+    assert "fiber_operator: FIBER_OPERATOR_NAMESPCES is not a setting" in done.stderr
 
 
 def test_the_process_says_why_it_cannot_begin(tmp_path: Path) -> None:

@@ -93,7 +93,10 @@ def test_all_invalid_settings_are_reported_at_once() -> None:
     message = str(caught.value)
     assert "LOG_LEVEL" in message
     assert "NAMESPACE=" in message
-    assert "FIBER_OPERATOR_NAMESPCES is no setting; there are FIBER_OPERATOR_CONCURRENCY" in message
+    assert (
+        "FIBER_OPERATOR_NAMESPCES is not a setting. The settings are FIBER_OPERATOR_CONCURRENCY"
+        in message
+    )
 
 
 @pytest.mark.parametrize(

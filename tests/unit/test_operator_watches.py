@@ -11,10 +11,10 @@ import pytest
 from fakes.kubernetes_api import Fault
 from fakes.world import World, a_world, configuration
 from fiber_operator.cluster import Configuration
+from fiber_operator.health import WatchStatus
 from fiber_operator.process import OperatorProcess
 from fiber_operator.responses import Refused, Unavailable
 from fiber_operator.settings import OperatorSettings
-from fiber_operator.watches import WatchStatus
 from patience import PATIENCE
 
 SAID = 'pods is forbidden: User "operator" cannot watch resource "pods" at the cluster scope'
@@ -32,17 +32,17 @@ def all_well(*namespaces: str) -> WatchStatus:
 
 
 def test_watches_that_are_open_are_well() -> None:
-    assert all_well().wrong() == all_well("one", "two").wrong() == []
+    assert all_well().problems() == all_well("one", "two").problems() == []
 
 
 def test_each_watch_must_have_begun() -> None:
     watches = WatchStatus(["one"])
-    assert watches.wrong() == ["nothing is watched: changes are seen late"]
+    assert watches.problems() == ["kopf does not run: changes are seen late"]
     watches.started(True)
     watches.answered("list pods in one", None)
     watches.answered("watch pods in one", None)
     watches.answered("watch leases in one", None)
-    (said,) = watches.wrong()
+    (said,) = watches.problems()
     assert said == "changes are seen late: watch fiberpools in one has not begun yet"
 
 
@@ -50,7 +50,7 @@ def test_when_kopf_begins_again_its_watches_do_and_the_informers_goes_on() -> No
     watches = all_well()
     watches.started(False)
     watches.started(True)
-    assert watches.wrong() == [
+    assert watches.problems() == [
         "changes are seen late: watch fiberpools has not begun yet",
         "changes are seen late: watch leases has not begun yet",
     ]
@@ -61,20 +61,20 @@ def test_a_missing_right_is_named_until_it_is_there(caplog: pytest.LogCaptureFix
     with caplog.at_level(logging.INFO):
         for _ in range(5):
             watches.answered("watch pods", REFUSED)
-        (said,) = watches.wrong()
+        (said,) = watches.problems()
         assert said == (
             f"changes are not seen: watch pods: {SAID}. Give the operator's account this right: "
             "the chart's roles have it"
         )
         watches.answered("watch pods", None)
-    assert watches.wrong() == []
+    assert watches.problems() == []
     assert caplog.messages == [said, "watch pods works again"]
 
 
 def test_other_failures_are_reported_too() -> None:
     watches = all_well()
     watches.answered("list pods", Unavailable("too busy", what="list pods", status=500))
-    assert watches.wrong() == ["changes are not seen: list pods: too busy"]
+    assert watches.problems() == ["changes are not seen: list pods: too busy"]
 
 
 @pytest.mark.parametrize("verb", ["list", "watch"])

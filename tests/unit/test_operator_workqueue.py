@@ -11,11 +11,11 @@ import pytest
 
 from fakes import virtual_time
 from fiber_operator.workqueue import (
-    CROWD,
     FIRST_BACKOFF,
     GAP,
     LONGEST_BACKOFF,
-    LULL,
+    MOST_RUNNING,
+    PAUSE,
     Key,
     Result,
     WorkQueue,
@@ -148,36 +148,36 @@ async def test_a_pool_always_rests_between_reconciles(
 
 @played()
 async def test_a_lull_ends_a_rest(queue: WorkQueue, reconciler: Reconciler) -> None:
-    reconciler.result = Result(rest=4.0, lull=True)
+    reconciler.result = Result(rest=4.0, early=True)
     queue.add(A)
     await asyncio.sleep(1)
     queue.add(A)
-    await asyncio.sleep(LULL / 2)
+    await asyncio.sleep(PAUSE / 2)
     queue.add(A)
     await asyncio.sleep(20)
-    assert reconciler.times() == pytest.approx([0.0, 1 + 1.5 * LULL])
+    assert reconciler.times() == pytest.approx([0.0, 1 + 1.5 * PAUSE])
 
 
 @played()
 async def test_what_a_rest_lacked_is_made_up_for(queue: WorkQueue, reconciler: Reconciler) -> None:
-    reconciler.result = Result(rest=4.0, lull=True)
+    reconciler.result = Result(rest=4.0, early=True)
     queue.add(A)
     await asyncio.sleep(1)
     queue.add(A)
     await asyncio.sleep(1)
     queue.add(A)  # it has not rested from its second reconcile and would owe for two
     await asyncio.sleep(20)
-    assert reconciler.times() == pytest.approx([0.0, 1 + LULL, 8.0])
+    assert reconciler.times() == pytest.approx([0.0, 1 + PAUSE, 8.0])
 
 
 @played()
 async def test_while_events_do_not_cease_a_pool_rests(
     queue: WorkQueue, reconciler: Reconciler
 ) -> None:
-    reconciler.result = Result(rest=4.0, lull=True)
+    reconciler.result = Result(rest=4.0, early=True)
     queue.add(A)
     for _ in range(90):
-        await asyncio.sleep(LULL / 1.5)
+        await asyncio.sleep(PAUSE / 1.5)
         queue.add(A)
     assert reconciler.times() == pytest.approx([0.0, 4.0, 8.0])
 
@@ -186,7 +186,7 @@ async def test_while_events_do_not_cease_a_pool_rests(
 async def test_no_lull_brings_a_failed_pool_back_early(
     queue: WorkQueue, reconciler: Reconciler
 ) -> None:
-    reconciler.result = Result(failed=True, rest=4.0, lull=True)
+    reconciler.result = Result(failed=True, rest=4.0, early=True)
     queue.add(A)
     await asyncio.sleep(1)
     queue.add(A)
@@ -331,7 +331,7 @@ async def test_a_turn_that_lasts_hands_its_place_on_to_so_many(
         queue.add(Key("team", str(number)))
     await asyncio.sleep(50)
     assert [when for when, _ in reconciler.begun] == [0, 0, 2, 2, 4, 4, 6, 6]
-    assert reconciler.most_at_once == CROWD * 2
+    assert reconciler.most_at_once == MOST_RUNNING * 2
 
 
 @played()
