@@ -2,27 +2,88 @@
 
 from __future__ import annotations
 
-from chart.helm import Helm, kinds, named
+from typing import Any
+
+import pytest
+
+from chart.helm import Helm, Manifest, kinds, named
+from chart.policy_cases import ALLOWED, FORBIDDEN, Body, of_context, of_pod, with_more
+
+cel: Any = pytest.importorskip("cel", reason="pip install common-expression-language")
 
 POLICY = "ValidatingAdmissionPolicy"
+CREATED: Body = {"admissionPolicy": {"create": True}}
+TEMPLATE = of_pod(containers=[{"name": "worker", "image": "fiber-worker"}])
+ALICE = "alice"
+LAB = "system:serviceaccount:lab:"
+
+
+def refusals(policy: Manifest, template: Body, user: str = ALICE) -> list[str]:
+    """Return what the policy says of a new pool in the namespace ``lab``; empty: it may be made."""
+    request = {"operation": "CREATE", "namespace": "lab", "userInfo": {"username": user}}
+    known: Body = {"object": {"spec": {"template": template}}, "request": request, "variables": {}}
+    spec = policy["spec"]
+    assert all(
+        cel.evaluate(condition["expression"], known) for condition in spec["matchConditions"]
+    )
+    for variable in spec["variables"]:
+        known["variables"][variable["name"]] = cel.evaluate(variable["expression"], known)
+    return [
+        cel.evaluate(validation["messageExpression"], known)
+        for validation in spec["validations"]
+        if not cel.evaluate(validation["expression"], known)
+    ]
+
+
+@pytest.fixture
+def policy(helm: Helm) -> Manifest:
+    return named(helm.render(CREATED), POLICY)
 
 
 def test_is_off_unless_wanted(helm: Helm) -> None:
     assert POLICY not in kinds(helm.render())
 
 
-def test_each_refusal_names_the_user_the_reason_and_the_remedy(helm: Helm) -> None:
-    manifests = helm.render({"admissionPolicy": {"create": True}})
-    for validation in named(manifests, POLICY)["spec"]["validations"]:
-        assert validation["messageExpression"].startswith("variables.who + ")
-        assert "ask an administrator" in validation["messageExpression"]
+@pytest.mark.parametrize("case", FORBIDDEN)
+def test_a_forbidden_field_is_refused_with_user_reason_and_remedy(
+    case: str, policy: Manifest
+) -> None:
+    more, words = FORBIDDEN[case]
+    (said,) = refusals(policy, with_more(TEMPLATE, more))
+    assert said.startswith(f"the template of {ALICE} asks for ")
+    assert words in said
+    assert "ask an administrator" in said
+
+
+@pytest.mark.parametrize("case", ALLOWED)
+def test_other_fields_pass(case: str, policy: Manifest) -> None:
+    assert refusals(policy, with_more(TEMPLATE, ALLOWED[case])) == []
+
+
+def test_every_rule_refuses_a_template(policy: Manifest) -> None:
+    said = {
+        line
+        for more, _ in FORBIDDEN.values()
+        for line in refusals(policy, with_more(TEMPLATE, more))
+    }
+    assert len(said) == len(policy["spec"]["validations"])
+
+
+def test_only_the_account_itself_has_its_account(policy: Manifest) -> None:
+    template = with_more(TEMPLATE, of_pod(serviceAccountName="master"))
+    assert refusals(policy, template, f"{LAB}master") == []
+    others = (ALICE, "master", f"{LAB}other", "system:serviceaccount:lab2:master")
+    assert all(refusals(policy, template, user) for user in others)
 
 
 def test_values_allow_accounts_and_capabilities(helm: Helm) -> None:
     values = {"create": True, "serviceAccounts": ["trainer"], "capabilities": ["SYS_PTRACE"]}
-    text = str(named(helm.render({"admissionPolicy": values}), POLICY)["spec"])
-    assert '["trainer"]' in text
-    assert '["SYS_PTRACE"]' in text
+    policy = named(helm.render({"admissionPolicy": values}), POLICY)
+    allowed = of_context(capabilities={"add": ["SYS_PTRACE"]})
+    allowed["spec"]["serviceAccountName"] = "trainer"
+    assert refusals(policy, with_more(TEMPLATE, allowed)) == []
+    for more in (of_context(capabilities={"add": ["NET_RAW"]}), of_pod(serviceAccountName="other")):
+        assert len(refusals(policy, with_more(TEMPLATE, more))) == 1
 
 
 def test_it_holds_where_the_operator_works_and_no_label_excepts(helm: Helm) -> None:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import copy
 import json
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from e2e.kube import Body, Refused, path_of
+from chart.policy_cases import ALLOWED, FORBIDDEN, of_pod, with_more
+from e2e.accounts import ACCOUNT, may_use_pools
+from e2e.kube import Body, Failed, Refused, path_of
 from e2e.leftovers import leaves_nothing
 from e2e.pools import Pool, says, template
 from e2e.program import Programs
@@ -20,65 +21,7 @@ from e2e.test_drain import squares
 pytestmark = pytest.mark.timeout(240, func_only=True)
 
 DRY = {"dryRun": "All"}
-PORT = {"containerPort": 80, "hostPort": 80}
-
-
-def of_pod(**spec: object) -> Body:
-    return {"spec": spec}
-
-
-def of_container(kind: str = "containers", **fields: object) -> Body:
-    return {"spec": {kind: [{"name": "worker", "image": "fiber-worker", **fields}]}}
-
-
-ASKED = {
-    "the node's network": (of_pod(hostNetwork=True), "network, processes or IPC"),
-    "the node's processes": (of_pod(hostPID=True), "network, processes or IPC"),
-    "the node's IPC": (of_pod(hostIPC=True), "network, processes or IPC"),
-    "a folder of the node": (
-        of_pod(volumes=[{"name": "root", "hostPath": {"path": "/"}}]),
-        "hostPath",
-    ),
-    "privilege": (of_container(securityContext={"privileged": True}), "a privileged container"),
-    "privilege at first": (
-        of_container("initContainers", securityContext={"privileged": True}),
-        "a privileged container",
-    ),
-    "a capability": (
-        of_container(securityContext={"capabilities": {"add": ["NET_ADMIN"]}}),
-        "more capabilities",
-    ),
-    "a driver of the node": (
-        of_pod(volumes=[{"name": "driver", "flexVolume": {"driver": "example.com/any"}}]),
-        "flexVolume",
-    ),
-    "a process of the node": (
-        of_pod(securityContext={"windowsOptions": {"hostProcess": True}}),
-        "hostProcess",
-    ),
-    "the whole of /proc": (of_container(securityContext={"procMount": "Unmasked"}), "procMount"),
-    "no seccomp": (
-        of_pod(securityContext={"seccompProfile": {"type": "Unconfined"}}),
-        "Unconfined",
-    ),
-    "no seccomp in the container": (
-        of_container(securityContext={"seccompProfile": {"type": "Unconfined"}}),
-        "Unconfined",
-    ),
-    "kernel parameters": (
-        of_pod(securityContext={"sysctls": [{"name": "kernel.msgmax", "value": "1"}]}),
-        "sysctls",
-    ),
-    "a node by its name": (of_pod(nodeName="node-1"), "nodeName"),
-    "a priority class of the system": (
-        of_pod(priorityClassName="system-node-critical"),
-        "priority class of the system",
-    ),
-    "a port of the node": (of_container(ports=[PORT]), "hostPort"),
-    "another account": (of_pod(serviceAccountName="master"), "ServiceAccount"),
-    "another account, by its old name": (of_pod(serviceAccount="master"), "ServiceAccount"),
-}
-"""Changes of a good template, and a word of the policy's refusal."""
+GROUP = "rbac.authorization.k8s.io"
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -97,13 +40,6 @@ def guarded(scene: Scene) -> Scene:
     return scene
 
 
-def with_more(agent: Body, more: Body) -> Body:
-    """Merge it into the template; a list replaces one of the same name."""
-    changed = copy.deepcopy(agent)
-    changed["spec"].update(copy.deepcopy(more["spec"]))
-    return changed
-
-
 def refusal(scene: Scene, manifest: Body) -> str:
     """Return why the API server would not take it; empty if it would."""
     try:
@@ -115,41 +51,33 @@ def refusal(scene: Scene, manifest: Body) -> str:
 
 def test_forbidden_template_fields_are_refused(guarded: Scene, agent: Body) -> None:
     pool = Pool(guarded, "es")
-    for case, (more, word) in ASKED.items():
+    for case, (more, reason) in FORBIDDEN.items():
         said = refusal(guarded, pool.manifest(with_more(agent, more)))
-        words = (
-            "HTTP 403",
-            "denied request: the template of ",
-            word,
-            "Take it out",
-            "ask an administrator",
-        )
+        words = ("HTTP 403", "denied request: the template of ", reason, "ask an administrator")
         assert says(said, *words), case
 
 
 def test_allowed_template_fields_pass(guarded: Scene, agent: Body) -> None:
-    context = {"runAsNonRoot": True, "capabilities": {"drop": ["ALL"]}, "privileged": False}
-    more = {
-        "hostNetwork": False,
-        "serviceAccountName": "default",
-        "volumes": [
-            {"name": "tmp", "emptyDir": {}},
-            {"name": "anothers", "secret": {"secretName": "warm-fiber-key"}},
-        ],
-        "initContainers": [{"name": "first", "image": "x", "securityContext": context}],
-    }
     pool = Pool(guarded, "es")
-    absent = dict.fromkeys(["volumes", "initContainers", "securityContext", "serviceAccount"])
-    nothing = {"add": None, "drop": ["ALL"]}
-    for good in (
-        of_pod(),
-        of_pod(**more),
-        of_pod(**absent),
-        of_container(securityContext=None, ports=None),
-        of_container(securityContext={"capabilities": None}),
-        of_container(securityContext={"capabilities": nothing}, ports=[{"hostPort": None}]),
-    ):
-        assert refusal(guarded, pool.manifest(with_more(agent, good))) == ""
+    for case, more in ALLOWED.items():
+        assert refusal(guarded, pool.manifest(with_more(agent, more))) == "", case
+
+
+def test_a_person_who_is_named_like_an_account_is_not_that_account(
+    guarded: Scene, agent: Body
+) -> None:
+    may_use_pools(guarded)
+    account = f"system:serviceaccount:{guarded.namespace}:{ACCOUNT}"
+    subjects = [{"kind": "User", "name": ACCOUNT, "apiGroup": GROUP}]
+    role = {"apiGroup": GROUP, "kind": "ClusterRole", "name": "fiber-user"}
+    binding = {"metadata": {"name": "person"}, "roleRef": role, "subjects": subjects}
+    guarded.kube.create(guarded.path("rolebindings"), binding)
+    asked = with_more(agent, of_pod(serviceAccountName=ACCOUNT))
+    manifest = json.dumps(Pool(guarded, "es").manifest(asked))
+    create = ("create", "--dry-run=server", "--filename", "-", "--as")
+    assert "created" in guarded.kube.kubectl(*create, account, stdin=manifest)
+    with pytest.raises(Failed, match=f"the template of {ACCOUNT} asks for a ServiceAccount"):
+        guarded.kube.kubectl(*create, ACCOUNT, stdin=manifest)
 
 
 def test_a_label_excepts_a_namespace_and_pools_that_are_there_go_on(
