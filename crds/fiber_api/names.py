@@ -136,6 +136,8 @@ MAX_PROBLEMS: Final = 10
 """Problems that a status shows."""
 POD_SUFFIX_LENGTH: Final = 10
 """Hexadecimal digits that end a pod's name; forty random bits, never used again."""
+SECRET_SUFFIX_LENGTH: Final = 16
+"""Hexadecimal digits that end the name of a Secret which replaces one of an unknown maker."""
 
 POOL_NAME_PATTERN: Final = "[a-z]([-a-z0-9]*[a-z0-9])?"
 """Pattern of a pool's name. Its Service has the same name, which must be a DNS label that begins
@@ -143,6 +145,9 @@ with a letter."""
 
 _POOL_NAME = re.compile(POOL_NAME_PATTERN)
 _POD_SUFFIX = re.compile(f"[0-9a-f]{{{POD_SUFFIX_LENGTH}}}")
+_SECRET_NAME = re.compile(
+    f"({POOL_NAME_PATTERN})-fiber-key(?:-[0-9a-f]{{{SECRET_SUFFIX_LENGTH}}})?"
+)
 
 
 class InvalidName(ValueError):
@@ -187,8 +192,17 @@ def budget_name(pool: str) -> str:
 
 
 def secret_name(pool: str) -> str:
-    """Return the name of the Secret with the pool's key: at most 60 characters."""
+    """Return the name of the Secret with the pool's key: at most 60 characters.
+
+    A program adds a random suffix if it cannot tell who made the Secret of that name.
+    """
     return f"{pool}-fiber-key"
+
+
+def pool_of_secret(secret: str) -> str | None:
+    """Return the pool for whose key the name ``secret`` is reserved; None if there is none."""
+    found = _SECRET_NAME.fullmatch(secret)
+    return None if found is None else found[1]
 
 
 def master_lease_name(pool: str) -> str:

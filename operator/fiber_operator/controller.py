@@ -549,6 +549,7 @@ class Controller:
         self._states.pop(key, None)
         self._metrics.pools.pop(key, None)
         self._lease_monitor.follow(key, None)
+        self._dependents.forget(*key)
 
 
 def _master_lease(pool: FiberPool) -> MasterLease | None:

@@ -66,12 +66,43 @@ class _Obstructed(Exception):
         self.obstacle = obstacle
 
 
+class _SecretUsers:
+    """Pools that name a Secret in ``spec.credentialsSecretName``, each as it was last checked."""
+
+    def __init__(self) -> None:
+        self._pools: dict[tuple[str, str], tuple[str, float]] = {}
+
+    def __contains__(self, pool: FiberPool) -> bool:
+        return (pool.metadata.namespace, pool.metadata.name) in self._pools
+
+    def earlier(self, pool: FiberPool, secret: str) -> str | None:
+        """Note the pool as a user; return the name of the first one that names the Secret."""
+        namespace, name = pool.metadata.namespace, pool.metadata.name
+        self._pools[namespace, name] = secret, pool.metadata.creation_timestamp or 0.0
+        users = [
+            (made, user)
+            for (where, user), (named, made) in self._pools.items()
+            if (where, named) == (namespace, secret)
+        ]
+        first = min(users)[1]
+        return None if first == name else first
+
+    def forget(self, namespace: str, name: str) -> None:
+        """Forget a pool that is gone."""
+        self._pools.pop((namespace, name), None)
+
+
 class DependentsReconciler:
     """Creates and repairs the dependents of pools.  ``now`` returns unix seconds."""
 
     def __init__(self, cluster: Cluster, now: Callable[[], float]) -> None:
         self._cluster = cluster
         self._now = now
+        self._users = _SecretUsers()
+
+    def forget(self, namespace: str, name: str) -> None:
+        """Forget a pool that is gone."""
+        self._users.forget(namespace, name)
 
     async def ensure(self, pool: FiberPool, known: Dependents | None) -> Dependents:
         """Create what is missing; ``known`` is the result of the last call for the pool.
@@ -149,19 +180,29 @@ class DependentsReconciler:
         return text(mapping(existing, "metadata").get("creationTimestamp"))
 
     async def _check_brought(self, pool: FiberPool, name: str) -> None:
-        """Refuse a Secret that belongs to another pool."""
+        """Refuse a Secret that belongs to another pool, or that an earlier pool names too."""
+        reserved = names.pool_of_secret(name)
+        if reserved is None:
+            self._check_users(pool, name)
+        elif reserved != pool.metadata.name:
+            why = f"a name that is reserved for the Secret of a FiberPool {reserved}"
+            raise _wrong_secret(name, why, reserved)
         try:
             existing = await self._cluster.read(SECRETS, pool.metadata.namespace, name)
         except Gone:
             return  # the pods wait for it
         if (other := manifests.other_owner(pool, existing)) is not None:
-            message = (
-                f"spec.credentialsSecretName is {name}, which is the Secret of the FiberPool "
-                f"{other}. The workers could pose as those of {other}. Leave credentialsSecretName "
-                "out, so that the operator makes a Secret, or name one that belongs to no other "
-                "pool. The field cannot be changed, so make the pool anew."
-            )
-            raise _Obstructed(Obstacle(Reason.INVALID_CREDENTIALS, message, True))
+            raise _wrong_secret(name, f"which is the Secret of the FiberPool {other}", other)
+
+    def _check_users(self, pool: FiberPool, name: str) -> None:
+        """Refuse a Secret that an earlier pool names too."""
+        is_new = pool not in self._users
+        if (earlier := self._users.earlier(pool, name)) is not None:
+            raise _wrong_secret(name, f"which the earlier FiberPool {earlier} names too", earlier)
+        refused = [p for p in pool.status.problems if p.reason == Reason.INVALID_CREDENTIALS]
+        if is_new and refused:
+            # After a restart of the operator, the earlier pool may not have been checked yet.
+            raise _Obstructed(Obstacle(Reason.INVALID_CREDENTIALS, refused[0].message, True))
 
     async def _service(self, pool: FiberPool) -> str:
         name, namespace = names.service_name(pool.metadata.name), pool.metadata.namespace
@@ -293,6 +334,15 @@ def _former_addresses(pool: FiberPool) -> list[str]:
 def _has_ports(spec: Mapping[str, Any], ports: list[Body]) -> bool:
     there = [{key: port.get(key) for key in ports[0]} for port in items(spec.get("ports"))]
     return there == ports
+
+
+def _wrong_secret(name: str, why: str, other: str) -> _Obstructed:
+    message = (
+        f"spec.credentialsSecretName is {name}, {why}. The workers could pose as those of {other}. "
+        "Leave credentialsSecretName out, so that the operator makes a Secret, or name one that "
+        "belongs to no other pool. The field cannot be changed, so make the pool anew."
+    )
+    return _Obstructed(Obstacle(Reason.INVALID_CREDENTIALS, message, True))
 
 
 def _taken(pool: FiberPool, resource: ResourceType, name: str, existing: Body) -> Obstacle:

@@ -32,13 +32,13 @@ def test_a_secret_of_another_pool_is_refused(by: str) -> None:
     @played
     async def test(world: World) -> None:
         owner = {"kind": "FiberPool", "name": "theirs", "uid": "77", "controller": True}
-        metadata: dict[str, Any] = {"name": "theirs-fiber-key"}
+        metadata: dict[str, Any] = {"name": "renamed"}
         if by == "owner":
             metadata["ownerReferences"] = [owner]
         else:
             metadata["labels"] = {"fiber.dev/pool": "theirs"}
         world.store.create("secrets", NAMESPACE, {"metadata": metadata, "data": {}})
-        world.make_pool(replicas=2, credentialsSecretName="theirs-fiber-key")
+        world.make_pool(replicas=2, credentialsSecretName="renamed")
         await world.until(lambda: "InvalidCredentials" in world.reasons(), 30)
         assert world.pods() == []
         message = world.status()["problems"][0]["message"]
@@ -46,6 +46,45 @@ def test_a_secret_of_another_pool_is_refused(by: str) -> None:
         assert "Leave credentialsSecretName out" in message
 
     test()
+
+
+@pytest.mark.parametrize("name", ["later-fiber-key", f"later-fiber-key-{'a1' * 8}"])
+def test_the_name_of_another_pools_secret_is_refused_before_that_pool_exists(name: str) -> None:
+    @played
+    async def test(world: World) -> None:
+        world.make_pool(replicas=1, credentialsSecretName=name)
+        await world.until(lambda: "InvalidCredentials" in world.reasons(), 30)
+        assert world.pods() == []
+        message = world.status()["problems"][0]["message"]
+        assert "reserved for the Secret of a FiberPool later" in message
+
+    test()
+
+
+def shared(world: World, pool: str) -> bool:
+    problems = world.status(pool).get("problems") or []
+    return any("which the earlier FiberPool es names too" in p["message"] for p in problems)
+
+
+def test_a_secret_that_an_earlier_pool_names_too_is_refused() -> None:
+    async def main() -> None:
+        async with a_world() as world:
+            world.make_pool(replicas=1, credentialsSecretName="mine")
+            await world.ready(1)
+            await asyncio.sleep(1)  # creationTimestamp is in whole seconds
+            world.make_pool("another", replicas=1, credentialsSecretName="mine")
+            await world.until(lambda: shared(world, "another"), 30)
+            await world.stop()
+            # The later pool is the first that the operator sees.
+            world.start()
+            world.edit("another", replicas=2)
+            await world.settled(120)
+            assert shared(world, "another")
+            assert len(world.pods()) == 1, "all of the earlier pool"
+            world.store.delete("fiberpools", NAMESPACE, "es", {})
+            await world.ready(2, "another")
+
+    virtual_time.run(main())
 
 
 def test_a_secret_that_names_the_pool_as_its_owner_is_taken() -> None:

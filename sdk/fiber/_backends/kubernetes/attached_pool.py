@@ -284,7 +284,7 @@ def pool_key_of(secret: Body) -> str:
     return identity.key_in(secret.get("data") or {})
 
 
-_NAME_BYTES = 8
+_NAME_BYTES = names.SECRET_SUFFIX_LENGTH // 2
 """Random bytes in the name of a Secret that replaces another one."""
 _EPOCH = 1
 """Epoch of an own pool, which never has another master."""
