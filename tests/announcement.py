@@ -40,7 +40,7 @@ def _parts(others: Sequence[str], environment: Mapping[str, str]) -> Iterator[tu
     choice, _ = ability.choose(environment)
     if choice is Choice.OWN and build.missing("kubernetes"):
         yield "building Kubernetes for the operator's scenarios, this time only", build.minutes()
-    yield "faults, examples, the chart", _PROGRAMS
+    yield "faults, processes, examples, the chart", _PROGRAMS
     conformance = "conformance with each backend"
     if choice is Choice.NONE:
         yield conformance, _CONFORMANCE

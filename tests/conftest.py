@@ -19,7 +19,9 @@ from leaks import Snapshot, Watch, shut_down_runtime
 from patience import PATIENCE
 
 if TYPE_CHECKING:
+    from fiber._transport.loop import Loop
     from fiber.connection import Connection
+    from hosts import Far, Hosts, Wire
 
 # Seconds for one test; a test with its own timeout marker keeps that. The limit ends a hang that no
 # deadline of the test ends, so it is longer than two of them.
@@ -70,6 +72,41 @@ def pipe() -> Iterator[tuple[Connection, Connection]]:
     one, other = fiber.Pipe()
     with one, other:
         yield one, other
+
+
+def _running_loop() -> Iterator[Loop]:
+    from fiber._transport.loop import Loop
+
+    running = Loop()
+    running.start_thread("loop under test")
+    yield running
+    running.stop()
+
+
+loop = pytest.fixture(_running_loop, name="loop")
+module_loop = pytest.fixture(_running_loop, scope="module", name="module_loop")
+
+
+@pytest.fixture
+def hosts() -> Iterator[Hosts]:
+    from hosts import Hosts
+
+    hosts = Hosts()
+    yield hosts
+    hosts.close()
+
+
+@pytest.fixture
+def wires(hosts: Hosts) -> tuple[Wire, Wire]:
+    return hosts.link("b", "a")
+
+
+@pytest.fixture
+def far(hosts: Hosts, wires: tuple[Wire, Wire]) -> Iterator[Far]:
+    with hosts.at("b"):
+        from hosts import Far
+
+        yield Far(hosts)
 
 
 _INTERRUPTED = pytest.ExitCode.INTERRUPTED

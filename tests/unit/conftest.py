@@ -1,4 +1,4 @@
-"""Fixtures of several modules: a loop, the ends of links, two hosts in one process."""
+"""Fixtures of several modules: the ends of links, and pipes between two hosts."""
 
 from __future__ import annotations
 
@@ -9,24 +9,12 @@ import pytest
 
 import fiber
 from fiber._transport.credentials import MasterCredentials, make_credentials
-from fiber._transport.loop import Loop
 from fiber.connection import Connection
-from hosts import Far, Hosts, Wire
+from hosts import Far
 from unit.executor_rig import Rig
 
 if TYPE_CHECKING:
     from unit.link_site import Site
-
-
-def _running_loop() -> Iterator[Loop]:
-    running = Loop()
-    running.start_thread("loop under test")
-    yield running
-    running.stop()
-
-
-loop = pytest.fixture(_running_loop, name="loop")
-module_loop = pytest.fixture(_running_loop, scope="module", name="module_loop")
 
 
 @pytest.fixture(scope="module")
@@ -48,24 +36,6 @@ def rig() -> Iterator[Rig]:
     rig = Rig(2)
     yield rig
     rig.close()
-
-
-@pytest.fixture
-def hosts() -> Iterator[Hosts]:
-    hosts = Hosts()
-    yield hosts
-    hosts.close()
-
-
-@pytest.fixture
-def wires(hosts: Hosts) -> tuple[Wire, Wire]:
-    return hosts.link("b", "a")
-
-
-@pytest.fixture
-def far(hosts: Hosts, wires: tuple[Wire, Wire]) -> Iterator[Far]:
-    with hosts.at("b"):
-        yield Far(hosts)
 
 
 @pytest.fixture

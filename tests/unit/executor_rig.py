@@ -20,7 +20,7 @@ from fiber._transport.loop import LoopTimer
 from fiber._wire import work
 from fiber._wire.packet import Message
 from fiber.process import PoolProcess, Process
-from unit import pool_tasks as tasks
+from processes import pool_tasks as tasks
 
 
 class ManualLoop:

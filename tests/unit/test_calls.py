@@ -10,7 +10,7 @@ from fiber._engine.tasks import Limits
 from fiber._runtime.jobs import CallQueue
 from fiber.errors import FiberError
 from fiber.futures import CallFuture
-from unit import pool_tasks as tasks
+from processes import pool_tasks as tasks
 from unit.executor_rig import Rig
 
 

@@ -26,7 +26,7 @@ from fiber._runtime.workers import KILL_AFTER, WorkerHandle
 from fiber._wire import work
 from fiber.errors import FiberError, WorkerDied
 from patience import PATIENCE
-from unit import pool_tasks as tasks
+from processes import pool_tasks as tasks
 from unit.executor_rig import Results, Rig
 
 """Yield to another thread."""

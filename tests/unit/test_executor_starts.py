@@ -13,7 +13,7 @@ from fiber._engine import scheduler, start_failures
 from fiber._runtime.workers import KILL_AFTER
 from fiber._wire import work
 from fiber.errors import FiberError
-from unit import pool_tasks as tasks
+from processes import pool_tasks as tasks
 from unit.executor_rig import Rig
 
 

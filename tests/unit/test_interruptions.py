@@ -39,8 +39,8 @@ from fiber.connection import Connection, wait
 from fiber.results import IMapIterator
 from hosts import Hosts, objects_kept
 from patience import PATIENCE
+from processes.pool_programs import run_program
 from unit.interrupting import CALLS, INSTRUCTIONS, is_interrupted
-from unit.pool_programs import run_program
 
 MORE_THAN_FITS = 2000
 

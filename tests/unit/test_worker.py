@@ -21,7 +21,7 @@ from fiber._agent import worker as worker_module
 from fiber._agent.worker import FUNCTIONS, BatchRunner, Watchdog
 from fiber._wire import packet, work
 from patience import PATIENCE
-from unit import pool_tasks as tasks
+from processes import pool_tasks as tasks
 
 
 class Channel:

@@ -15,7 +15,7 @@ from census import wait_until
 from fiber import futures
 from fiber.pool import MaybeEncodingError
 from patience import PATIENCE
-from unit import pool_tasks as tasks
+from processes import pool_tasks as tasks
 
 
 class Waits:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from unit.pool_programs import run_program
+from processes.pool_programs import run_program
 
 LIMIT = """
 import resource

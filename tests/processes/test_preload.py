@@ -16,7 +16,7 @@ from fiber._agent import preload, zygote
 from fiber._agent.last_words import ProgressTable
 from fiber._agent.preload import Imports
 from patience import PATIENCE
-from unit.test_zygote import Master, progress_table
+from processes.test_zygote import Master, progress_table
 
 __all__ = ["progress_table"]
 

@@ -16,7 +16,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from fiber.vector import VectorEnv
-from unit.test_vector_env import play_both, same
+from processes.test_vector_env import play_both, same
 from vector_envs import Sampling, Step
 
 MIXES = int(os.environ.get("RANDOM_VECTOR_ENVS", "4"))

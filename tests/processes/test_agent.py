@@ -285,7 +285,7 @@ def test_close_kills_and_reports_every_child_once(
 
 
 def test_children_that_started_live_on_when_forking_became_unfit(own: Agent) -> None:
-    threads = {"preload": ["unit.threads_at_import"]}
+    threads = {"preload": ["processes.threads_at_import"]}
     spawned = begin(own, run_forever, method="spawn")
     spawned[1].wait_for_start()
     forked = [begin(own, run_forever, preparation=threads) for _ in range(3)]

@@ -22,9 +22,9 @@ from fiber._runtime.jobs import CallQueue
 from fiber._runtime.work_items import Call
 from fiber.futures import CallFuture
 from patience import PATIENCE
-from unit import pool_tasks as tasks
+from processes import pool_tasks as tasks
+from processes.pool_programs import run_program, wait_until
 from unit.interrupting import INSTRUCTIONS, is_interrupted
-from unit.pool_programs import run_program, wait_until
 
 
 @pytest.fixture
@@ -472,7 +472,7 @@ def test_the_program_ends_after_its_tasks() -> None:
     done = run_program(
         """
         import fiber
-        from unit import pool_tasks as tasks
+        from processes import pool_tasks as tasks
         executor = fiber.Executor(2)
         future = executor.submit(tasks.sleep, 0.3)
         future.add_done_callback(lambda future: print(future.result(), flush=True))

@@ -17,7 +17,7 @@ import fiber
 from census import wait_until
 from fiber.pool import Pool
 from patience import PATIENCE
-from unit import pool_tasks as tasks
+from processes import pool_tasks as tasks
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from census import wait_until
 from fiber._agent import last_words, zygote
 from fiber._agent.last_words import ProgressTable
 from patience import PATIENCE
-from unit.test_zygote import Master
+from processes.test_zygote import Master
 
 
 def left(text: str) -> str:

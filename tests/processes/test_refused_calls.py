@@ -24,9 +24,9 @@ from fiber._transport.loop import Loop
 from fiber.errors import FiberError, StartError
 from fiber.futures import BrokenProcessPool
 from patience import PATIENCE
-from unit import pool_tasks as tasks
-from unit.pool_programs import wait_until
-from unit.test_loopback import running
+from processes import pool_tasks as tasks
+from processes.pool_programs import wait_until
+from processes.test_loopback import running
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 

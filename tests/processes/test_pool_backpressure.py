@@ -13,7 +13,7 @@ import pytest
 import fiber
 from fiber import results
 from fiber.pool import Pool
-from unit.pool_programs import wait_until
+from processes.pool_programs import wait_until
 
 RESULT = 1 << 16
 HELD = 16 * RESULT

@@ -18,8 +18,8 @@ from fiber._transport.loop import Loop
 from fiber._wire.descriptor import contents
 from fiber._wire.memory_files import Blob
 from patience import PATIENCE
+from processes.test_agent import begin, end, settled
 from unit.shipping_site import packed, write
-from unit.test_agent import begin, end, settled
 
 PATHS = ProgramPaths(("es",), (), "es", None)
 

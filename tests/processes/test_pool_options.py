@@ -13,7 +13,7 @@ import pytest
 import fiber
 from fiber.pool import Pool
 from patience import PATIENCE
-from unit import pool_tasks as tasks
+from processes import pool_tasks as tasks
 
 
 @pytest.fixture

@@ -34,8 +34,8 @@ from fiber._runtime.state import runtime
 from fiber._runtime.work_items import InputStream
 from fiber.pool import Pool
 from patience import PATIENCE
-from unit import pool_tasks as tasks
-from unit.pool_programs import run_program, wait_until
+from processes import pool_tasks as tasks
+from processes.pool_programs import run_program, wait_until
 
 FIBER = str(Path(fiber.__file__).parent)
 
@@ -341,7 +341,7 @@ def test_a_finalizer_on_the_loops_thread_is_refused_what_it_would_wait_for() -> 
         import threading, time
         import fiber
         from fiber._runtime.state import runtime
-        from unit import pool_tasks as tasks
+        from processes import pool_tasks as tasks
         with fiber.Pool(2) as pool:
             late = pool.apply_async(time.sleep, (60,))
             for wait in (
@@ -524,7 +524,7 @@ def test_a_fork_within_the_block_of_a_pool_ends_as_it_says(ending: str) -> None:
     program = f"""
         import os, sys
         import fiber
-        from unit import pool_tasks as tasks
+        from processes import pool_tasks as tasks
         with fiber.Pool(1) as pool:
             pool.map(tasks.square, range(3))
             pid = os.fork()

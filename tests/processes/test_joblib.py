@@ -14,8 +14,8 @@ import pytest
 
 import fiber.joblib
 from faults.runtime import running
-from unit import pool_tasks as tasks
-from unit.pool_programs import wait_until
+from processes import pool_tasks as tasks
+from processes.pool_programs import wait_until
 
 call = joblib.delayed
 

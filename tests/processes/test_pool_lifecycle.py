@@ -21,8 +21,8 @@ import pytest
 import fiber
 from fiber.process import PoolProcess
 from patience import PATIENCE
-from unit import pool_tasks as tasks
-from unit.pool_programs import ENVIRON, is_alive, run_program, wait_until
+from processes import pool_tasks as tasks
+from processes.pool_programs import ENVIRON, is_alive, run_program, wait_until
 
 # The end
 
@@ -259,7 +259,7 @@ def test_a_fork_of_the_program_cannot_use_its_pool() -> None:
 def test_a_program_may_end_with_a_living_pool(ending: str) -> None:
     done = run_program(f"""
         import fiber
-        from unit import pool_tasks as tasks
+        from processes import pool_tasks as tasks
         pool = fiber.Pool(2)
         print(pool.map(tasks.square, range(4)), *[process.pid for process in pool._pool], sep=";")
         waiting = pool.map_async(tasks.sleep, [600] * 100)
@@ -301,7 +301,7 @@ def test_ctrl_c_ends_a_wait(tmp_path: Path, call: str) -> None:
             textwrap.dedent(f"""
                 import pathlib
                 import fiber
-                from unit import pool_tasks as tasks
+                from processes import pool_tasks as tasks
                 path = pathlib.Path({str(path)!r})
                 with fiber.Pool(2) as pool:
                     try:
@@ -328,7 +328,7 @@ def test_after_ctrl_c_the_pool_goes_on(tmp_path: Path) -> None:
     done = run_program(f"""
         import pathlib, signal, threading
         import fiber
-        from unit import pool_tasks as tasks
+        from processes import pool_tasks as tasks
         path, gate = pathlib.Path({str(path)!r}), pathlib.Path({str(gate)!r})
 
         def interrupt():

@@ -17,7 +17,7 @@ from fiber._runtime.threads import BackgroundThread
 from fiber.errors import UnpicklableError
 from fiber.pool import AsyncResult, Pool
 from patience import PATIENCE
-from unit import pool_tasks as tasks
+from processes import pool_tasks as tasks
 
 
 @pytest.fixture

@@ -215,7 +215,7 @@ def test_a_hang_up_ends_it(progress_table: ProgressTable) -> None:
 def test_it_ends_when_its_agent_does_though_someone_holds_its_socket() -> None:
     script = """
         import os, signal, subprocess
-        from unit.test_zygote import ProgressTable, Master
+        from processes.test_zygote import ProgressTable, Master
         master = Master(ProgressTable())
         child, socket = master.started(1), master.sock.fileno()
         holder = subprocess.Popen(["sleep", "60"], stdout=subprocess.DEVNULL, pass_fds=[socket])
@@ -237,7 +237,7 @@ def test_it_removes_the_directory_of_an_agent_that_was_killed(moment: str, tmp_p
     directory.mkdir()
     script = f"""
         import os, signal
-        from unit.test_zygote import ProgressTable, Master
+        from processes.test_zygote import ProgressTable, Master
         master = Master(ProgressTable(), cleanup_directory={str(directory)!r})
         if {moment!r} == "later":
             master.started(1)
@@ -288,7 +288,7 @@ def test_once_its_imports_made_forking_unsafe_it_forks_no_more(
     progress_table: ProgressTable, method: str
 ) -> None:
     master = Master(progress_table, imports=None)
-    threads = {"preload": ["unit.threads_at_import"]}
+    threads = {"preload": ["processes.threads_at_import"]}
     master.started(1, method="spawn")
     for number in (2, 3):
         master.start(number, preparation=threads)

@@ -12,7 +12,7 @@ import fiber
 from fiber.errors import FiberError
 from fiber.pool import Pool
 from patience import PATIENCE
-from unit.pool_programs import wait_until
+from processes.pool_programs import wait_until
 
 
 class Asking:

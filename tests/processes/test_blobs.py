@@ -24,7 +24,7 @@ from fiber._wire.descriptor import contents
 from fiber._wire.memory_files import Blob
 from memory_link import SimulatedLoop
 from patience import PATIENCE
-from unit.test_loopback import running
+from processes.test_loopback import running
 
 LARGE = 3 << 20
 

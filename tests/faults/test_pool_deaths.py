@@ -16,8 +16,8 @@ from fiber._engine import start_failures
 from fiber.errors import StartError, WorkerDied
 from fiber.pool import Pool
 from patience import PATIENCE
-from unit import pool_tasks as tasks
-from unit.pool_programs import run_program
+from processes import pool_tasks as tasks
+from processes.pool_programs import run_program
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import pytest
 import fiber
 from fiber.queues import SimpleQueuePush
 from patience import PATIENCE
-from unit.test_loopback import running
+from processes.test_loopback import running
 
 MORE_THAN_A_SOCKET = range(1000)
 """Small messages that no socket holds."""
