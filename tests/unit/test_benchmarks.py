@@ -1,88 +1,160 @@
-"""The benchmarks: their arithmetic, their pages, a contender that fails."""
+"""The benchmarks' arithmetic, budgets and pages."""
 
 from __future__ import annotations
 
 import json
 import os
 import sys
-from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
-from benchmarks import budgets, contenders, overhead, processes, report, samples  # noqa: E402
-from benchmarks.model import Case, Metric, Run  # noqa: E402
-from benchmarks.rounds import in_turn  # noqa: E402
-from benchmarks.session import Failed, Session  # noqa: E402
+from benchmarks import (  # noqa: E402
+    budgets,
+    coldstart,
+    executors,
+    kubernetes_cluster,
+    kubernetes_report,
+    latency,
+    machine,
+    overhead,
+    report,
+    samples,
+    vector,
+    workers,
+)
+from benchmarks.contenders import ALL, BY_NAME, ON_PODS  # noqa: E402
+from benchmarks.model import Run  # noqa: E402
 from benchmarks.suite import MEASURES  # noqa: E402
 
-from unit.benchmark_runs import about  # noqa: E402
-
-ABOUT = about(rounds=3, versions={"numpy": "2.0"}, skipped={"ray": "ray"})
-
-
-def test_summary_ignores_rounds_without_a_value() -> None:
-    assert samples.summary([3.0, None, 1.0, 2.0]) == samples.Summary(2.0, 1.0, 3.0, 3)
-    assert samples.summary([None]) is None
-
-
-def test_ratio_is_taken_within_a_round() -> None:
-    # The machine was ten times slower in the second round: the ratio of the medians would be 1.
-    found = samples.ratio([1.0, 10.0, 1.5], [2.0, 20.0, 1.0])
-    assert found == samples.Summary(0.5, 0.5, 1.5, 3)
-
-
-def test_ratio_uses_only_the_rounds_that_both_took_part_in() -> None:
-    assert samples.ratio([4.0], [2.0, 8.0, 8.0]) == samples.Summary(2.0, 2.0, 2.0, 1)
-    assert samples.ratio([None, 4.0], [2.0]) is None
+ABOUT = {
+    "date": "2026-01-01 00:00 UTC",
+    "command": "python benchmarks/run.py",
+    "rounds": 3,
+    "size": 1.0,
+    "cores": 2,
+    "processor": "a processor",
+    "memory": "8.00 GB",
+    "load": 0.0,
+    "system": "Linux 6",
+    "python": "3.11.0",
+    "versions": {"numpy": "2.0"},
+    "skipped": {"ray": "ray"},
+}
+BASELINE = BY_NAME["multiprocessing"]
+SHORT = overhead.case_name(0.001, "chunksize 1")
 
 
-def test_percentile_is_a_value_that_occurred() -> None:
-    values = [float(n) for n in range(100, 0, -1)]
-    assert samples.percentile(values, 50) == 51.0
-    assert samples.percentile(values, 95) == 96.0
-    assert samples.percentile([7.0], 95) == 7.0
+def a_run(*values: tuple[str, str, dict[str, float]], **fields: Any) -> Run:
+    """Return a run of one round with these values: case, contender, metrics."""
+    run = Run(dict(ABOUT), **fields)
+    for case, contender, sample in values:
+        run.add(case, contender, 0, sample)
+    return run
+
+
+# -- Arithmetic
 
 
 @pytest.mark.parametrize(
-    ("value", "unit", "words"),
+    ("ours", "theirs", "found"),
     [
-        (1.0, "s", "1.00 s"),
-        (0.00131, "s", "1.31 ms"),
-        (0.0000842, "s", "84.2 µs"),
-        (12345.6, "1/s", "12,346 /s"),
-        (5.2e9, "B", "5.20 GB"),
+        # The machine was ten times slower in the second round: medians would have the ratio 1.
+        ([1.0, 10.0, 1.5], [2.0, 20.0, 1.0], (0.5, 0.5, 1.5, 3)),
+        ([4.0], [2.0, 8.0, 8.0], (2.0, 2.0, 2.0, 1)),
+        ([None, 4.0], [2.0], None),
     ],
 )
-def test_numbers_in_words(value: float, unit: str, words: str) -> None:
-    assert samples.in_words(value, unit) == words
+def test_a_ratio_is_taken_within_a_round_of_both(
+    ours: list[float | None], theirs: list[float | None], found: tuple[Any, ...] | None
+) -> None:
+    assert samples.ratio(ours, theirs) == (found and samples.Summary(*found))
 
 
-@pytest.mark.parametrize(("value", "words"), [(1.004, "1.004x"), (0.65, "0.65x"), (61.2, "61.2x")])
-def test_ratios_in_words(value: float, words: str) -> None:
-    assert samples.times(value) == words
+def test_a_summary_and_a_percentile_are_values_that_occurred() -> None:
+    assert samples.summary([3.0, None, 1.0, 2.0]) == samples.Summary(2.0, 1.0, 3.0, 3)
+    assert samples.summary([None]) is None
+    values = [float(n) for n in range(100, 0, -1)]
+    assert [samples.percentile(values, percent) for percent in (50, 95)] == [51.0, 96.0]
 
 
-def test_order_rotates_and_visits_everyone() -> None:
-    everyone = contenders.ALL[:3]
-    first = [in_turn(everyone, turn)[0] for turn in range(3)]
-    assert first == list(everyone)
-    assert sorted(each.name for each in in_turn(everyone, 2)) == sorted(e.name for e in everyone)
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (samples.in_words(1.0, "s"), "1.00 s"),
+        (samples.in_words(0.00131, "s"), "1.31 ms"),
+        (samples.in_words(0.0000842, "s"), "84.2 µs"),
+        (samples.in_words(12345.6, "1/s"), "12,346 /s"),
+        (samples.in_words(5.2e9, "B"), "5.20 GB"),
+        (samples.in_words(312.5e6, "B/s"), "312 MB/s"),
+        (samples.times(1.004), "1.004x"),
+        (samples.times(0.65), "0.65x"),
+        (samples.times(61.2), "61.2x"),
+    ],
+)
+def test_a_number_has_three_digits_and_a_unit(words: str, said: str) -> None:
+    assert words == said
 
 
-def test_a_run_survives_json() -> None:
-    run = Run(dict(ABOUT))
-    run.add("case", "fiber", 1, {"time": 2.0})
-    run.fail("case", "spark", "not finished after 20 s", after=20.0)
-    again = Run.from_json(json.loads(json.dumps(run.as_json())))
-    assert again == run
-    assert again.series("case", "fiber", "time") == [None, 2.0]
+@pytest.mark.parametrize(
+    ("after", "share"),
+    [
+        ("cpu  10 5 5 180 0 0 0 0 0 0", 0.1),
+        ("cpu  0 0 0 100 100 0 0 0 0 0", 0.0),  # a disk at work is not a processor at work
+        ("cpu  0 0 0 150 0 0 0 50 0 0", 0.25),  # the machine's other guests
+        ("cpu  50 0 0 150 0 0 0 0 50 0", 0.25),  # a guest's time is in the first number too
+        ("cpu  0 0 0 0 0 0 0 0 0 0", 0.0),
+    ],
+)
+def test_the_share_in_use_excludes_idle_time(after: str, share: float) -> None:
+    before = "cpu  0 0 0 0 0 0 0 0 0 0\ncpu0 1 2 3"
+    assert machine.share_in_use(before, after) == pytest.approx(share)
+    assert 0 <= machine.in_use() <= 1
 
 
-def overhead_run(fiber: float, baseline: float) -> Run:
+@pytest.mark.parametrize(
+    ("tick", "seconds", "counted"), [(0.1, 2.0, 20), (1.0, 1.0, 1)], ids=["many", "one"]
+)
+def test_the_rate_of_a_vector_excludes_its_first_steps(
+    monkeypatch: pytest.MonkeyPatch, tick: float, seconds: float, counted: int
+) -> None:
+    clock = iter(range(100))
+    monkeypatch.setattr(vector, "time", SimpleNamespace(perf_counter=lambda: next(clock) * tick))
+    made: list[None] = []
+    rate = vector._rate(lambda: made.append(None), 8, seconds)
+    assert rate == pytest.approx(8 / tick)
+    assert len(made) == counted + (3 if counted > 1 else 1)
+
+
+def test_a_cold_start_ends_with_its_last_worker_and_its_map() -> None:
+    second = 10**9
+    stamps = [("worker", 5 * second), ("map", 4 * second), ("worker", 3 * second)]
+    assert coldstart.times_from(2 * second, stamps) == {"ready": 3.0, "map": 2.0}
+
+
+# -- Budgets
+
+
+def budget_of(measure: str, **fields: object) -> budgets.Budget:
+    return next(
+        each
+        for each in budgets.BUDGETS
+        if each.measure == measure and all(getattr(each, k) == v for k, v in fields.items())
+    )
+
+
+OVERHEAD = budget_of("overhead", case=SHORT)
+THROUGHPUT = budget_of("throughput", at_least=True)
+WORKERS = budget_of("workers")
+SPARK = budget_of("overhead", contender="spark")
+
+
+def overhead_run(fiber: float, baseline: float = 1.0) -> Run:
     run = Run(dict(ABOUT))
     for turn in range(3):
         for duration in overhead.DURATIONS:
@@ -93,51 +165,66 @@ def overhead_run(fiber: float, baseline: float) -> Run:
     return run
 
 
-def budget_for(case: str) -> budgets.Budget:
-    return next(each for each in budgets.BUDGETS if each.case == case)
+def too_slow(after: float) -> Run:
+    run = overhead_run(2.0)
+    run.fail(SPARK.case, "spark", "not finished", after=after)
+    return run
+
+
+def failed() -> Run:
+    run = Run(dict(ABOUT))
+    run.fail(SHORT, "fiber", "ended with exit status 1")
+    return run
 
 
 @pytest.mark.parametrize(
-    ("fiber", "kept", "verdict"),
-    [(0.9, True, "met"), (0.95, True, "met"), (1.045, False, "missed by 10.0 %")],
+    ("budget", "run", "kept", "said"),
+    [
+        (OVERHEAD, overhead_run(0.95), True, "met"),
+        (OVERHEAD, overhead_run(1.045), False, "missed by 10.0 %"),
+        (OVERHEAD, None, None, "not measured"),
+        (OVERHEAD, failed(), None, "not measured: ended with exit status 1"),
+        (
+            THROUGHPUT,
+            a_run(
+                (THROUGHPUT.case, THROUGHPUT.contender, {THROUGHPUT.metric: 75.0}),
+                (THROUGHPUT.case, "multiprocessing", {THROUGHPUT.metric: 2.0}),
+            ),
+            False,
+            "missed by 25.0 %",
+        ),
+        (
+            WORKERS,
+            a_run(
+                (workers.workers(10), "fiber", {workers.COST.name: 2e-4}),
+                (workers.workers(5000), "fiber", {workers.COST.name: 4.4e-4}),
+            ),
+            False,
+            "missed by 100 %",
+        ),
+        (SPARK, too_slow(90.0), True, "met"),
+        (SPARK, too_slow(20.0), None, "not measured"),
+    ],
+    ids=[
+        "met",
+        "missed",
+        "not-run",
+        "failed",
+        "at-least",
+        "another-case",
+        "rival-too-slow",
+        "rival-stopped-early",
+    ],
 )
-def test_budget_on_a_ratio(fiber: float, kept: bool, verdict: str) -> None:
-    budget = budget_for(overhead.case_name(0.001, "chunksize 1"))
-    found = budgets.judge(budget, {"overhead": overhead_run(fiber, 1.0)})
-    assert (found.kept, found.verdict) == (kept, verdict)
+def test_a_budget_is_judged(
+    budget: budgets.Budget, run: Run | None, kept: bool | None, said: str
+) -> None:
+    found = budgets.judge(budget, {budget.measure: run} if run else {})
+    assert found.kept is kept
+    assert found.verdict.startswith(said)
 
 
-def test_budget_that_asks_for_at_least() -> None:
-    budget = next(
-        each for each in budgets.BUDGETS if each.at_least and each.measure == "throughput"
-    )
-    run = Run(dict(ABOUT))
-    run.add(budget.case, budget.contender, 0, {budget.metric: 75.0})
-    run.add(budget.case, "multiprocessing", 0, {budget.metric: 2.0})
-    found = budgets.judge(budget, {"throughput": run})
-    assert (found.kept, found.measured, found.verdict) == (False, "37.5x", "missed by 25.0 %")
-
-
-def test_budget_of_an_unmeasured_case() -> None:
-    budget = budget_for(overhead.case_name(0.001, "chunksize 1"))
-    assert budgets.judge(budget, {}).kept is None
-    run = Run(dict(ABOUT))
-    run.fail(budget.case, "fiber", "ended with exit status 1: no message")
-    found = budgets.judge(budget, {"overhead": run})
-    assert found.verdict == "not measured: ended with exit status 1: no message"
-
-
-def test_a_rival_that_was_too_slow_to_finish_keeps_a_budget_on_its_slowness() -> None:
-    budget = next(each for each in budgets.BUDGETS if each.contender == "spark")
-    run = overhead_run(2.0, 1.0)
-    run.fail(budget.case, "spark", "not finished after 90 s", after=90.0)
-    found = budgets.judge(budget, {"overhead": run})
-    assert (found.kept, found.measured) == (True, "> 45.0x")
-    run.fail(budget.case, "spark", "not finished after 20 s", after=20.0)
-    assert budgets.judge(budget, {"overhead": run}).kept is None
-
-
-def test_every_budget_is_on_a_case_that_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_budget_is_on_a_case_that_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     # With one processor, no work can be limited to two.
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
     measured = {
@@ -145,7 +232,7 @@ def test_every_budget_is_on_a_case_that_is_measured(monkeypatch: pytest.MonkeyPa
         for measure in MEASURES.values()
         for case in measure.cases(1.0)
         for metric in case.metrics
-        for contender in contenders.ALL
+        for contender in ALL
         if case.needs in contender.offers
     }
     for each in budgets.BUDGETS:
@@ -153,78 +240,134 @@ def test_every_budget_is_on_a_case_that_is_measured(monkeypatch: pytest.MonkeyPa
         if not each.unit:
             case, contender = each.divisor
             assert (each.measure, case, each.metric, contender) in measured, each.what
+    on_pipes = [each.case for each in budgets.BUDGETS if each.measure == "pipes"]
+    assert len(on_pipes) == len(set(on_pipes)) == 5 * 3 + 2
 
 
-def test_case_names_are_unique_in_a_measure() -> None:
-    for name, measure in MEASURES.items():
-        names = [case.name for case in measure.cases(1.0)]
-        assert len(names) == len(set(names)), name
+def test_the_budgets_of_the_vector_are_those_of_the_design() -> None:
+    assert {
+        (each.what, each.contender, each.against, each.to_case, each.bound)
+        for each in budgets.BUDGETS
+        if each.measure == "vector"
+    } == {
+        ("vector: 64 CartPoles", "fiber", "async-vector-env", "", 3),
+        ("vector: 64 CartPoles", "fiber", "pufferlib", "", 1),
+        (
+            "vector: uneven steps, first ready to waiting for all",
+            "fiber",
+            "multiprocessing",
+            "64 uneven ones",
+            1.5,
+        ),
+        ("vector: loopback to local, 64 with 84x84x4 bytes", "fiber-loopback", "fiber", "", 0.5),
+    }
 
 
-def test_page_shows_ratio_budget_failures_and_skipped_contenders() -> None:
-    run = overhead_run(0.5, 1.0)
-    run.fail(overhead.case_name(0.0001, "chunksize 1"), "spark", "not finished after 20 s")
-    page = report.page("overhead", run)
-    assert "| Fiber | 500 ms | 500 ms to 500 ms | 0.50x (0.50x to 0.50x) | ≤ 0.95x | met |" in page
-    assert "| 100 µs tasks, chunksize 1 | PySpark | not finished after 20 s |" in page
-    assert "| all | Ray's Pool | skipped, not installed: ray |" in page
-    assert "2 cores (a processor), 8.00 GB of memory" in page
+# -- Pages
 
 
-def test_measuring_one_thing_again_keeps_the_other_pages(tmp_path: Path) -> None:
+LATENCIES = [("fiber-loopback", 3e-4), ("multiprocessing", 1e-4), ("ray", 2e-3)]
+SUBMITTED = [("fiber-executor", 60e3), ("concurrent.futures", 10e3), ("loky", 5e3)]
+
+
+@pytest.mark.parametrize(
+    ("measure", "run", "lines"),
+    [
+        (
+            "overhead",
+            overhead_run(0.5),
+            [
+                "| Fiber | 500 ms | 500 ms to 500 ms | 0.50x (0.50x to 0.50x) | ≤ 0.95x | met |",
+                "| all | Ray's Pool | skipped, not installed: ray |",
+                "2 cores (a processor), 8.00 GB of memory",
+            ],
+        ),
+        ("overhead", failed(), [f"| {SHORT} | Fiber | ended with exit status 1 |"]),
+        (
+            "latency",
+            a_run(*((latency.NAME, name, {"p50": p, "p95": p}) for name, p in LATENCIES)),
+            ["| ≤ 2x; ≤ 0.25x Ray's Pool | missed by 50.0 %; met |"],
+        ),
+        (
+            "executors",
+            a_run(*((executors.SUBMIT, name, {executors.RATE.name: n}) for name, n in SUBMITTED)),
+            [
+                "The ratio is to concurrent.futures in the same round",
+                "| 60,000 /s | one round | 6.00x | ≥ 5x; ≥ 5x loky | met; met |",
+            ],
+        ),
+        (
+            "vector",
+            a_run((vector.cart_poles(4096), "fiber", {vector.RATE.name: 1e5})),
+            ["|  | AsyncVectorEnv | not run: 4,096 processes |  |  |  |  |"],
+        ),
+        (
+            "latency",
+            a_run(in_use=[0.004, 0.02]),
+            ["others used 0 %, 2 % of the processors' time: the machine was idle"],
+        ),
+        (
+            "latency",
+            a_run(in_use=[0.0, 0.31]),
+            ["others used 0 %, 31 % of the processors' time: **the machine was not"],
+        ),
+    ],
+    ids=["ratio", "failure", "two-budgets", "baseline", "not-run", "idle", "busy"],
+)
+def test_a_page_shows_what_was_measured(measure: str, run: Run, lines: list[str]) -> None:
+    page = report.page(measure, run)
+    for line in lines:
+        assert line in page
+
+
+def test_a_second_measurement_keeps_the_pages_of_the_first(tmp_path: Path) -> None:
     # These tests draw no picture, because matplotlib never closes the fonts that it opens.
-    report.write(tmp_path, {"overhead": overhead_run(0.5, 1.0)}, new=[])
-    first = report.load(tmp_path)
-    assert first == {"overhead": overhead_run(0.5, 1.0)}
-    latency = Run(dict(ABOUT))
-    latency.add("apply", "multiprocessing", 0, {"p50": 1e-4, "p95": 2e-4})
-    report.write(tmp_path, {**first, "latency": latency}, new=[])
-    index = (tmp_path / "README.md").read_text(encoding="utf-8")
-    assert "(overhead.md)" in index
-    assert "(latency.md)" in index
-    assert "≤ 0.95x | 0.50x | met" in index
-
-
-def test_the_index_names_pages_of_other_commands_that_are_there(tmp_path: Path) -> None:
     (tmp_path / "operator.md").touch()
-    report.write(tmp_path, {"overhead": overhead_run(0.5, 1.0)}, new=[])
+    report.write(tmp_path, {"overhead": overhead_run(0.5)}, new=[])
+    first = report.load(tmp_path)
+    assert first == {"overhead": overhead_run(0.5)}
+    later = a_run(("apply", "multiprocessing", {"p50": 1e-4, "p95": 2e-4}))
+    report.write(tmp_path, {**first, "latency": later}, new=[])
     index = (tmp_path / "README.md").read_text(encoding="utf-8")
-    assert "(operator.md)" in index
+    for words in ("(overhead.md)", "(latency.md)", "(operator.md)", "≤ 0.95x | 0.50x | met"):
+        assert words in index
     assert "(kubernetes.md)" not in index
 
 
-def test_an_absent_peer_names_the_missing_package() -> None:
-    peer = contenders.Contender("x", "X", ("no_such_module_at_all",), frozenset(), "#000000", "o")
-    assert peer.missing() == "no_such_module_at_all"
+def test_a_run_survives_json() -> None:
+    run = a_run(("case", "fiber", {"time": 2.0}))
+    run.fail("case", "spark", "not finished after 20 s", after=20.0)
+    assert Run.from_json(json.loads(json.dumps(run.as_json()))) == run
 
 
-@pytest.fixture
-def session(tmp_path: Path) -> Iterator[Session]:
-    session = Session(contenders.BY_NAME["multiprocessing"], tmp_path)
-    yield session
-    session.interrupt()
+def runs_on_pods(pods: float) -> dict[str, Run]:
+    """Return runs in which every metric has this value on pods, and 1 without them."""
+    runs = {name: Run(dict(ABOUT)) for name in kubernetes_report.MEASURES}
+    for case in kubernetes_report.cases(1.0):
+        for contender, value in ((ON_PODS.name, pods), (BASELINE.name, 1.0)):
+            sample = {metric.name: value for metric in case.metrics}
+            runs[case.measure].add(case.name, contender, 0, sample)
+    return runs
 
 
-def latency_case(*, limit: float, **params: object) -> Case:
-    return Case("latency", "apply", "", "apply", params, (Metric("p50", "p50", "s"),), limit=limit)
+@pytest.mark.parametrize(("pods", "kept"), [(0.1, True), (1.0, True), (1.03, False)])
+def test_the_page_of_pods_has_all_measures_and_their_budgets(pods: float, kept: bool) -> None:
+    runs, cases = runs_on_pods(pods), kubernetes_report.cases(1.0)
+    verdicts = budgets.verdicts(runs, budgets.ON_PODS)
+    assert None not in {verdict.kept for verdict in verdicts}
+    bounded = [each.kept for each in verdicts if each.budget.measure == "overhead"]
+    assert bounded == [kept] * 8
+    page = kubernetes_report.page(runs)
+    assert all(f"| {case.name} |" in page for case in cases)
+    assert page.count("| Fiber, pods |") == sum(len(case.metrics) for case in cases)
+    assert f"overhead: 1 ms tasks, chunksize 1 | multiprocessing, fork | ≤ 1.02x | {pods}" in page
+    assert kubernetes_report.NOTES not in page
+    assert kubernetes_report.NOTES in kubernetes_report.page(runs, notes=True)
 
 
-def test_an_exception_of_a_contender_is_reported(session: Session) -> None:
-    with pytest.raises(Failed, match=r"TypeError: .*missing 1 required positional argument"):
-        session.run(latency_case(limit=20.0, calls=1))
-
-
-@pytest.mark.slow
-def test_a_contender_that_takes_too_long_is_stopped_with_its_workers(session: Session) -> None:
-    with pytest.raises(Failed, match="not finished after 1 s"):
-        session.run(latency_case(limit=1.0, calls=10**9, seconds=600.0))
-    below = processes.descendants(session.pid)
-    assert len(below) == 5
-    session.interrupt()
-    assert not any(os.path.exists(f"/proc/{pid}") for pid in (session.pid, *below))
-
-
-def test_the_death_of_a_contender_is_reported(session: Session) -> None:
-    case = Case("no_such_measure", "x", "", "map", {}, (), limit=20.0)
-    with pytest.raises(Failed, match="exit status 1: ModuleNotFoundError"):
-        session.run(case)
+def test_no_cluster_is_started_if_another_is_named(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("KUBECONFIG", "/somewhere/else")
+    assert kubernetes_cluster.main([]) == 1
+    assert "KUBECONFIG names another (/somewhere/else)" in capsys.readouterr().err

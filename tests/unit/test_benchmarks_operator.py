@@ -9,6 +9,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,6 @@ from benchmarks.operator_scale import (  # noqa: E402
     report,
     results,
     trial,
-    watched,
 )
 from benchmarks.operator_scale.cases import (  # noqa: E402
     BY_DEFAULT,
@@ -83,22 +83,14 @@ apiserver_request_total_of_something_else{verb="POST",resource="pods"} 70
 """
 
 
-def test_both_subjects_make_the_same_pods() -> None:
-    pool, replica_set = (subject.manifest("x", 40)["spec"] for subject in SUBJECTS)
-    assert pool["replicas"] == replica_set["replicas"] == 40
-    assert pool["template"]["spec"] == replica_set["template"]["spec"]
-
-
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_the_operator_understands_the_pool_and_may_have_all_of_it(case: Case) -> None:
-    manifest = FIBER.manifest("x", case.size)
-    manifest["metadata"].update(uid="u", namespace="n")
-    assert FiberPool.read(manifest).wanted == case.size
-
-
-def test_neither_is_always_the_first() -> None:
+def test_both_subjects_make_the_same_pods(case: Case) -> None:
+    pool, replica_set = (subject.manifest("x", case.size) for subject in SUBJECTS)
+    assert replica_set["spec"]["replicas"] == case.size
+    assert pool["spec"]["template"]["spec"] == replica_set["spec"]["template"]["spec"]
+    pool["metadata"].update(uid="u", namespace="n")
+    assert FiberPool.read(pool).wanted == case.size
     assert [in_turn(turn)[0] for turn in range(3)] == [FIBER, REPLICA_SET, FIBER]
-    assert set(in_turn(1)) == set(SUBJECTS)
 
 
 @pytest.mark.parametrize(
@@ -111,25 +103,19 @@ def test_neither_is_always_the_first() -> None:
         ({}, False),
     ],
 )
-def test_settled_means_that_the_status_describes_this_spec(
+def test_a_status_is_settled_if_it_describes_this_spec(
     status: dict[str, int], settled: bool
 ) -> None:
     assert is_settled({"metadata": {"generation": 2}, "status": status}, 5) is settled
 
 
-def test_requests_are_added_up_by_verb_and_resource() -> None:
+def test_requests_are_added_up_without_heartbeats_and_constant_parts() -> None:
     page = OPERATOR_PAGE % {"pods": 4, "born": 0}
     assert counters.operator_requests(page) == {"create pods": 5, "patch fiberpools/status": 4}
+    assert counters.server_writes(SERVER_PAGE) == {"POST pods": 8, "PATCH pods/status": 9}
     assert counters.value(page, "process_resident_memory_bytes") == 95e6
     with pytest.raises(KeyError):
         counters.value(page, "process_open_fds")
-
-
-def test_writes_of_all_clients_count_except_heartbeats() -> None:
-    assert counters.server_writes(SERVER_PAGE) == {"POST pods": 8, "PATCH pods/status": 9}
-
-
-def test_growth_omits_constant_parts() -> None:
     grown = counters.growth({"a": 1.0, "b": 2.0}, {"a": 3.0, "b": 2.0, "c": 5.0})
     assert list(grown.items()) == [("c", 5.0), ("a", 2.0)]
 
@@ -159,7 +145,7 @@ def result(*seconds: tuple[float, float], memory: float = 90e6) -> Result:
     return Result(dict(ABOUT), trials)
 
 
-def test_results_survive_the_file(tmp_path: Path) -> None:
+def test_results_survive_their_file(tmp_path: Path) -> None:
     known = {"1000": result((10.0, 9.0), (11.0, 10.0))}
     results.save(tmp_path / "x.json", known)
     assert results.load(tmp_path / "x.json") == known
@@ -174,44 +160,37 @@ def test_a_ratio_is_taken_within_a_round() -> None:
 
 
 @pytest.mark.parametrize(
-    ("seconds", "memory", "verdicts"),
+    ("case", "seconds", "memory", "verdicts"),
     [
-        (11.9, 149e6, ["met", "met"]),
-        (12.0, 150e6, ["missed by 0.0 %", "missed by 0.0 %"]),
-        (18.0, 165e6, ["missed by 50.0 %", "missed by 10.0 %"]),
+        ("1000", 11.9, 149e6, {"1,000 pods settled": "met", "memory": "met"}),
+        (
+            "1000",
+            18.0,
+            165e6,
+            {"1,000 pods settled": "missed by 50.0 %", "memory": "missed by 10.0 %"},
+        ),
+        ("100x10", 24.0, 90e6, {"100 times 10 pods settled": "missed by 100.0 %"}),
+        ("5000", 13.2, 90e6, {"5,000 pods settled": "missed by 10.0 %"}),
     ],
 )
-def test_budgets(seconds: float, memory: float, verdicts: list[str]) -> None:
-    found = report.budgets({"1000": result((seconds, 10.0), memory=memory)})
-    of_1000 = [line for line in found if "1,000 pods" in line.what and "of 20" not in line.what]
-    assert [line.verdict for line in of_1000] == verdicts
-    assert {line.verdict for line in found if line not in of_1000} == {"not measured"}
-
-
-def test_each_case_has_its_budget() -> None:
-    seconds = {"1000": 11.0, "100x10": 24.0, "5000": 13.2}
-    found = report.budgets({name: result((value, 10.0)) for name, value in seconds.items()})
-    assert {line.what.partition(" settled")[0]: line.verdict for line in found[:3]} == {
-        "1,000 pods": "met",
-        "100 times 10 pods": "missed by 100.0 %",
-        "5,000 pods": "missed by 10.0 %",
-    }
+def test_a_case_is_judged_by_its_budgets(
+    case: str, seconds: float, memory: float, verdicts: dict[str, str]
+) -> None:
+    found = report.budgets({case: result((seconds, 10.0), memory=memory)})
+    measured = [line for line in found if line.verdict != "not measured"]
+    assert len(measured) == len(verdicts)
+    for line, (words, verdict) in zip(measured, verdicts.items(), strict=True):
+        assert words in line.what
+        assert line.verdict == verdict
 
 
 @pytest.mark.parametrize(("seconds", "verdict"), [(9.9, "met"), (11.0, "missed by 10.0 %")])
-def test_kubernetes_defaults_need_not_be_beaten(seconds: float, verdict: str) -> None:
+def test_the_defaults_of_kubernetes_are_a_budget_and_a_row(seconds: float, verdict: str) -> None:
     known = result((seconds, 9.0), (99.0, 9.0))
     known.trials.append(done(BY_DEFAULT, 0, 10.0))
     found = [line for line in report.budgets({"1000": known}) if "of 20" in line.what]
     assert [line.verdict for line in found] == [verdict, "not measured"]
-    assert "100 times 10 pods" in found[1].what
     assert f"| 10.0 s | {seconds / 10:.3g}" in report.page({"1000": known}, notes=False)
-
-
-def test_budgets_of_unmeasured_cases() -> None:
-    found = report.budgets({"5000": result((1.0, 1.0))})
-    of_1000 = [line for line in found if "1,000 pods" in line.what]
-    assert [line.verdict for line in of_1000] == ["not measured"] * 3
 
 
 def test_the_page_has_ratio_memory_requests_and_origin() -> None:
@@ -403,29 +382,25 @@ def test_a_trial_times_each_step_and_leaves_no_object(
         assert found.operator.memory_after == 95e6
 
 
-def test_a_watch_may_begin_before_it_is_wholly_made(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Listed(Kube):
-        def __init__(self) -> None: ...
-
-        def call(self, method: str, path: str, *_: Any, **__: Any) -> Any:
-            return {"metadata": {"resourceVersion": "1"}, "items": []}
-
-    monkeypatch.setattr(watched, "Stream", lambda kube, begin, tell: begin())
-    assert [count for _, count in watched.Watched(Listed(), "/pools", 0.0).ready] == [0]
-
-
-def test_an_unserved_pool_is_reported_and_removed(kube: Fake, api: Api, operator: Operator) -> None:
-    api.idle = True
-    case = Case("tiny", "4 pods", 1, 4, rounds=1, limit=0.2)
-    with pytest.raises(trial.TooSlow, match=r"FiberPool, 4 pods: .* does not watch all namespaces"):
-        trial.run(kube, operator, case, FIBER, 0)
-    assert not api.namespaces
-
-
-def test_counters_of_another_process_are_not_used(kube: Fake, api: Api, operator: Operator) -> None:
-    api.restarts = True
-    with pytest.raises(CannotMeasure, match="the operator was restarted during a trial"):
-        trial.run(kube, operator, CASE, FIBER, 0)
+@pytest.mark.parametrize(
+    ("harm", "limit", "error", "said"),
+    [
+        ("idle", 0.2, trial.TooSlow, r"FiberPool, 3 times 4 pods: .* does not watch all namesp"),
+        ("restarts", 5.0, CannotMeasure, "the operator was restarted during a trial"),
+    ],
+)
+def test_a_trial_that_fails_is_reported_and_leaves_no_namespace(
+    kube: Fake,
+    api: Api,
+    operator: Operator,
+    harm: str,
+    limit: float,
+    error: type[Exception],
+    said: str,
+) -> None:
+    setattr(api, harm, True)
+    with pytest.raises(error, match=said):
+        trial.run(kube, operator, replace(CASE, limit=limit), FIBER, 0)
     assert not api.namespaces
 
 
@@ -445,7 +420,7 @@ def pod(name: str, ready: str = "True") -> dict[str, Any]:
     }
 
 
-def test_missing_parts_are_reported(kube: Fake, api: Api) -> None:
+def test_a_missing_operator_is_reported(kube: Fake, api: Api) -> None:
     with pytest.raises(CannotMeasure, match=r"does not know FiberPools .* --set-up"):
         find_operator(kube)
     kube.get = lambda path, **query: {}  # type: ignore[method-assign]
@@ -459,7 +434,7 @@ def test_missing_parts_are_reported(kube: Fake, api: Api) -> None:
     assert find_operator(kube).image == "i:1"
 
 
-def test_nodes_must_have_room(kube: Fake, api: Api) -> None:
+def test_nodes_without_room_are_reported(kube: Fake, api: Api) -> None:
     conditions = [{"type": "Ready", "status": "True"}]
     node = {"status": {"allocatable": {"pods": "500"}, "conditions": conditions}}
     api.lists["/api/v1/nodes"] = []
@@ -479,7 +454,7 @@ def test_nodes_must_have_room(kube: Fake, api: Api) -> None:
         (("--set-up",), "/nowhere", "--set-up is for the cluster of tests/cluster"),
     ],
 )
-def test_without_a_cluster_the_remedy_is_printed(
+def test_a_run_without_a_cluster_prints_the_remedy(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],

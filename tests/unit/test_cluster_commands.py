@@ -1,8 +1,7 @@
-"""Smoke tests of the test cluster's commands, daemons and recognition of what is its own."""
+"""Smoke tests of the test cluster's commands and recognition of what is its own."""
 
 from __future__ import annotations
 
-import os
 import re
 import subprocess
 import sys
@@ -15,12 +14,9 @@ import pytest
 from cluster import (
     cgroups,
     commands,
-    control_plane,
-    diagnosis,
     faults,
     images,
     lifecycle,
-    memory,
     network,
     places,
     remains,
@@ -29,7 +25,7 @@ from cluster.daemons import Daemon, all_daemons
 from cluster.lifecycle import Found
 from cluster.node import Node
 from cluster.pki import Pair, Pki
-from cluster.shell import ClusterError, wait_for
+from cluster.shell import ClusterError
 from patience import PATIENCE
 
 TESTS = Path(__file__).resolve().parents[1]
@@ -125,105 +121,6 @@ def test_an_error_is_a_sentence_and_not_a_traceback() -> None:
     assert "Traceback" not in done.stderr
     with pytest.raises(ClusterError, match="no daemon apisever"):
         faults.stop("apisever")
-
-
-# -- Daemons
-
-
-def record_of(daemon: Daemon) -> Path:
-    return places.STATE / "daemons" / f"{daemon.name}.process"
-
-
-def pid_of(daemon: Daemon) -> int:
-    return int(record_of(daemon).read_text().split()[0])
-
-
-def test_a_daemon_is_started_once_found_again_and_killed() -> None:
-    daemon = Daemon("sleeper")
-    for _ in range(2):
-        daemon.start(*SLEEP)
-    pid = pid_of(daemon)
-    assert Daemon("sleeper").runs()
-    assert [found.name for found in all_daemons()] == ["sleeper"]
-    # No interrupt of the terminal reaches it.
-    assert os.getpgid(pid) == pid != os.getpgid(0)
-    daemon.kill()
-    assert not daemon.runs()
-    Daemon("sleeper").start_again()
-    assert daemon.runs()
-    assert pid_of(daemon) != pid
-
-
-def test_a_daemon_inherits_no_variable() -> None:
-    daemon = Daemon("printer")
-    daemon.start("env")
-    wait_for("its end", lambda: not daemon.runs(), seconds=PATIENCE)
-    said = daemon.log.read_text()
-    assert "XDG" not in said
-    assert "PYTEST_CURRENT_TEST" not in said
-    assert f"PATH={places.programs()}:" in said
-
-
-def test_a_process_that_has_the_number_of_a_daemon_is_not_killed() -> None:
-    daemon = Daemon("sleeper")
-    daemon.start(*SLEEP)
-    record, pid = record_of(daemon).read_text(), pid_of(daemon)
-    daemon.kill()
-    record_of(daemon).write_text(record.replace(str(pid), str(os.getpid()), 1))
-    assert not daemon.runs()
-    daemon.kill()  # and the test goes on
-
-
-def test_the_controllers_get_another_rate_and_their_first_one_again() -> None:
-    manager = Daemon("controller-manager")
-    command = ["sh", "-c", "exec sleep 300.0625", "sh", "--bind-address=127.0.0.1"]
-    manager.start(*command, "--kube-api-qps=1000", "--kube-api-burst=2000")
-    before, first = manager.command, pid_of(manager)
-    control_plane.limit_controllers(20)
-    assert manager.command == [*command, "--kube-api-qps=20", "--kube-api-burst=30"]
-    assert pid_of(manager) != first
-    control_plane.limit_controllers()
-    assert manager.command == before
-    assert manager.runs()
-
-
-@pytest.mark.parametrize(
-    ("script", "said"),
-    [
-        ("for i in $(seq 30); do echo line $i; done; exit 3", "exit status 3"),
-        ("exit 0", "log, is empty"),
-        ("kill -SEGV $$", "signal 11"),
-    ],
-)
-def test_the_diagnosis_says_how_a_daemon_ended_and_its_last_words(script: str, said: str) -> None:
-    daemon = Daemon("node-2-containerd")
-    daemon.start("sh", "-c", script)
-    wait_for("its end", lambda: not daemon.runs(), seconds=PATIENCE)
-    found = diagnosis.end_of([daemon]) or ""
-    assert found.startswith("node-2-containerd has ended: ")
-    assert said in found.replace(str(daemon.log), "log").replace(".log,", "log,")
-    assert found.count("\nline ") == (15 if "seq" in script else 0)
-    assert "`make cluster-down`" in found
-    daemon.start(*SLEEP)
-    assert (daemon.status(), diagnosis.end_of([daemon])) == (None, None)
-
-
-def test_the_diagnosis_names_killings_and_shortages(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    daemon = Daemon("node-2-containerd")
-    daemon.start("sh", "-c", "kill -KILL $$")
-    wait_for("its end", lambda: not daemon.runs(), seconds=PATIENCE)
-    counters = tmp_path / "vmstat"
-    counters.write_text(f"pgfault 1\noom_kill {memory.kills() + 2}\n")
-    monkeypatch.setattr(memory, "_COUNTERS", counters)
-    monkeypatch.setattr(memory, "available", lambda: 17 << 20)
-    monkeypatch.setattr(diagnosis, "_free_space", lambda: 17 << 20)
-    said = diagnosis.end_of([daemon]) or ""
-    assert "the kernel has killed 2 of the machine's processes for want of memory" in said
-    assert "17 MiB of memory left" in said
-    assert "17 MiB of disk left" in said
-    assert diagnosis.silence_of([], "refused\n").startswith("the last answer: refused\n")
 
 
 # -- What belongs to the cluster
