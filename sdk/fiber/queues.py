@@ -29,7 +29,7 @@ from typing import Any, Generic, TypeVar
 from fiber import reduction
 from fiber._hub import local
 from fiber._hub.local import LocalChannel, LocalCounter
-from fiber._hub.queue_delivery import Dealer, Feeder, ItemCount, QueueSlots, arrive
+from fiber._hub.queue_delivery import Dealer, Feeder, ItemCount, QueueSlots, become_reader
 from fiber._transport.channels import SharedCounter
 from fiber._wire import packet
 from fiber._wire.packet import Message
@@ -306,7 +306,7 @@ class SimpleQueuePush(Generic[_T]):
     def _joined(self) -> Connection:
         with self._joining:  # two threads would make two readers, one of which never reads
             if self._reader is None:
-                self._reader = Connection(arrive(self._registration), writable=False)
+                self._reader = Connection(become_reader(self._registration), writable=False)
         return self._reader
 
     def __getstate__(self) -> tuple[Any, ...]:

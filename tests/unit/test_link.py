@@ -175,7 +175,7 @@ def test_a_killed_agent_is_lost(site: Site) -> None:
         process.kill()
         master.wait(lambda: master.events and "lost" in master.events[-1])
     assert master.events[-2] == "suspect"
-    assert "nothing was heard for" in master.events[-1]
+    assert "the other side was silent for" in master.events[-1]
 
 
 ECHO = """

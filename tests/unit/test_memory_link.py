@@ -109,7 +109,7 @@ def test_a_silent_peer_is_first_suspect_and_then_lost(loop: SimulatedLoop) -> No
     assert notes.events == ["suspect"]
     loop.run_until(lambda: len(notes.events) == 2, within=8)
     assert notes.events[1].startswith("lost: ")
-    assert "nothing was heard for 1" in notes.events[1]
+    assert "the other side was silent for 1" in notes.events[1]
 
 
 def test_messages_after_the_loss_are_dropped(loop: SimulatedLoop) -> None:

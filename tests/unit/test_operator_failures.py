@@ -75,9 +75,7 @@ def test_pods_that_fail_together_are_one_wave() -> None:
     assert count(told, failed(1), failed(2), now=due).failures.waiting == 0
 
 
-def test_what_fails_during_the_wait_is_of_the_same_wave_and_what_fails_after_it_of_the_next() -> (
-    None
-):
+def test_failures_during_the_delay_belong_to_the_same_wave_and_later_ones_to_the_next() -> None:
     first = count(Failures(), failed(1)).failures
     second = count(first, failed(1), failed(2), now=NOW + 4).failures
     assert (second.total, second.waves, second.waiting) == (2, 1, 2)
@@ -115,7 +113,7 @@ def failing(**fields: Any) -> Failures:
 def test_a_new_worker_that_stays_ready_for_a_minute_ends_the_waves() -> None:
     pod = ready(1, since=NOW + 15)
     early = count(failing(), pod, now=NOW + 74)
-    assert (early.failures.waves, early.recovers) == (2, NOW + 75)
+    assert (early.failures.waves, early.recovery_at) == (2, NOW + 75)
     found = count(failing(), pod, now=NOW + 75).failures
     assert (found.waves, found.next_create_time, found.total) == (0, None, 2)
     assert found.consecutive == 2, "one of four is fewer than half"
@@ -247,7 +245,7 @@ def test_sums_stay_within_the_limits_of_the_status() -> None:
     assert (found.total, found.disrupted, found.consecutive, found.waves) == (most,) * 4
 
 
-def test_what_the_cluster_ends_is_disrupted_once_and_waits_for_nothing() -> None:
+def test_a_pod_that_the_cluster_ends_counts_once_as_disrupted_and_is_replaced_at_once() -> None:
     drained = view(1, PodState.TERMINATING, trouble=Trouble.DISRUPTED)
     evicted = view(2, PodState.ENDED, trouble=Trouble.DISRUPTED)
     deleted = view(3, PodState.TERMINATING)

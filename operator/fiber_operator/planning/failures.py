@@ -73,7 +73,7 @@ class Account:
     disrupted: tuple[PodView, ...] = ()
     held_back: int = 0
     """Number of failed workers that are not to be replaced yet."""
-    recovers: float | None = None
+    recovery_at: float | None = None
     """Time at which the waves end if no worker fails until then."""
 
 
@@ -118,16 +118,16 @@ def account(
         found = _fail(found, failed, works, policy, seed, now)
     if works and not given_up(found, policy):
         found = _with(found, consecutive=0)
-    recovers = _recovers(found, pods, desired, policy, seed)
-    if recovers is not None and recovers <= now:
-        found, recovers = _with(found, waves=0, waiting=0, next_create_time=None), None
+    recovery_at = _recovery_time(found, pods, desired, policy, seed)
+    if recovery_at is not None and recovery_at <= now:
+        found, recovery_at = _with(found, waves=0, waiting=0, next_create_time=None), None
     return Account(
         found,
         _proven(proven, found, pods, failed, template_hash, now),
         tuple(failed),
         tuple(disrupted),
         found.waiting + len(failing) - len(failed),
-        recovers,
+        recovery_at,
     )
 
 
@@ -196,9 +196,9 @@ def _fail(
     if found.next_create_time is not None and found.next_create_time > now:
         return found  # the same wave
     lived = all(_has_lived(pod, now) for pod in failed)
-    in_vain = not works and any(map(in_itself, failed))
+    all_failing = not works and any(map(in_itself, failed))
     waves = 1 if lived else found.waves + 1
-    found = _with(found, waves=waves, consecutive=found.consecutive + in_vain)
+    found = _with(found, waves=waves, consecutive=found.consecutive + all_failing)
     if given_up(found, policy):
         return _with(found, waiting=0, next_create_time=None)
     # In whole seconds, as in the status.
@@ -213,7 +213,7 @@ def _reason(pod: PodView) -> str:
     return Reason.COMPLETED
 
 
-def _recovers(
+def _recovery_time(
     found: Failures, pods: Sequence[PodView], desired: int, policy: FailurePolicy, seed: str
 ) -> float | None:
     """Return the time at which workers will have lived long enough, if none fails until then.

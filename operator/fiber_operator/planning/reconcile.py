@@ -425,7 +425,7 @@ class _Planner:
         timeout = self._spec.failure_policy.startup_timeout_seconds
         times = [
             trial_ends,
-            self._account.recovers,
+            self._account.recovery_at,
             self._facts.master_state.due,
             self._facts.idleness.due,
             self._facts.refused_until,

@@ -58,7 +58,7 @@ _CLEANING_UP = 5.0
 more than a quarter of the grace.
 """
 
-_DRAINED = "Drained: its host was told to end (SIGTERM)"
+_DRAINED = "Drained: its host got SIGTERM"
 
 _OPEN = (
     "the kernel refused prctl(PR_SET_DUMPABLE), so tasks of this pod may read the credentials of "

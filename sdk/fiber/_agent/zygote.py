@@ -407,21 +407,21 @@ def _run_zygote(
     """
     progress_table, *archive = fds
     watched = _pidfds(ancestors)
-    told_to = False
+    ended_by_agent = False
     if watched:
-        told_to = Zygote(
+        ended_by_agent = Zygote(
             sock,
             ProgressTable(progress_table),
             watched,
             imports=imports,
             program=None if folder is None else (archive[0], folder),
         ).run()
-    ours = folder if told_to else cleanup_directory
-    if ours is not None:
+    removed = folder if ended_by_agent else cleanup_directory
+    if removed is not None:
         # Rarely needed; an import above would delay the first child.
         from fiber._hub.directory import remove_directory
 
-        remove_directory(ours)
+        remove_directory(removed)
 
 
 def _pidfds(ancestors: tuple[int, ...]) -> list[int]:

@@ -103,8 +103,8 @@ class Ledger:
         if job not in self.jobs or not len(items):
             return
         job.waiting.append(Span(job.fed, items, job.alone))
-        self._fed(job, len(items))
-        self._list(job)
+        self._add_fed(job, len(items))
+        self._give_turn(job)
 
     def pin(self, job: Job, worker: WorkerEntry | None, item: Any) -> None:
         """Add a task to ``job`` for this worker alone; None: for a later worker.
@@ -112,7 +112,7 @@ class Ledger:
         If the worker is lost, a later worker gets the task.
         """
         span = Span(job.fed, [item], alone=True, pin=True)
-        self._fed(job, 1)
+        self._add_fed(job, 1)
         if worker is None:
             self._unassigned_pins.append((job, span))
         else:
@@ -127,7 +127,7 @@ class Ledger:
     def close(self, job: Job) -> bool:
         """Close the job to further tasks; return True if that finishes it."""
         job.closed = True
-        return self._finish(job)
+        return self._drop_if_finished(job)
 
     def unfinished(self, job: Job) -> list[Any]:
         """Return the items of the job's tasks that are not done."""
@@ -169,7 +169,7 @@ class Ledger:
         if not paused:
             self._paused.discard(job)
             if job.waiting:
-                self._list(job)
+                self._give_turn(job)
         elif job in self.jobs:
             self._paused.add(job)
 
@@ -180,19 +180,19 @@ class Ledger:
         worker = WorkerEntry(key, left)
         worker.since = now
         self.workers.add(worker)
-        self._adopt(worker)
+        self._assign_pins(worker)
         self._load.sort(worker)
         return worker
 
-    def _adopt(self, worker: WorkerEntry) -> None:
+    def _assign_pins(self, worker: WorkerEntry) -> None:
         """Give a new worker the pinned tasks of a lost one, at most one of each job."""
-        left = []
+        remaining = []
         for job, span in self._unassigned_pins:
             if any(job is pinned[0] for pinned in worker.pinned):
-                left.append((job, span))
+                remaining.append((job, span))
             else:
                 self._pin(job, worker, span)
-        self._unassigned_pins = left
+        self._unassigned_pins = remaining
 
     def leave(self, worker: WorkerEntry) -> bool:
         """Give ``worker`` no more tasks; return False, and change nothing, if it is busy."""
@@ -245,8 +245,8 @@ class Ledger:
         held_back = sum([job.never_given for job in self._paused]) if self._paused else 0
         return self._open_tasks - held_back + len(self._cancelled)
 
-    def waits(self) -> bool:
-        """Return whether there are tasks that some worker may get."""
+    def has_assignable(self) -> bool:
+        """Return True if a worker may get a task."""
         return bool(self._turns or self._pins)
 
     # Assigning
@@ -270,7 +270,7 @@ class Ledger:
                 passed += 1  # the job keeps its turn and reserves a worker
                 continue
             del turns[passed]
-            batch = self._cut(job, worker, now) if worker is not None else None
+            batch = self._send_next(job, worker, now) if worker is not None else None
             job.listed = job.has_next
             if job.listed:
                 turns.append(job)
@@ -301,7 +301,7 @@ class Ledger:
             return None
         return self._load.queueable_after(passed)
 
-    def _cut(self, job: Job, worker: WorkerEntry, now: float) -> Batch:
+    def _send_next(self, job: Job, worker: WorkerEntry, now: float) -> Batch:
         waiting = len(job.waiting)
         size = 1
         if waiting > 1:
@@ -348,7 +348,7 @@ class Ledger:
 
     def expect_late(self, worker: WorkerEntry, seq: int) -> None:
         """Accept the answer of a worker to a call that its caller has given up."""
-        worker.had.append(seq)
+        worker.ended_seqs.append(seq)
 
     def return_idle(self, worker: WorkerEntry, now: float) -> None:
         """Take back a leased worker, which is idle."""
@@ -369,7 +369,7 @@ class Ledger:
         if job is None:
             self._cancelled.add(batch)
         else:
-            self._fed(job, 1)
+            self._add_fed(job, 1)
         self._hold(batch, now)
 
     def _end_lease(self, worker: WorkerEntry) -> None:
@@ -387,10 +387,10 @@ class Ledger:
         batch = self.batches.get(seq)
         if batch is not None and batch.worker is worker:
             return batch
-        if worker not in self.workers or (batch is None and seq in worker.had):
+        if worker not in self.workers or (batch is None and seq in worker.ended_seqs):
             return None
-        whose = "which it never had" if batch is None else "which another worker has"
-        raise WrongAnswer(f"it answered for batch {seq}, {whose}")
+        owner = "which it never had" if batch is None else "which another worker has"
+        raise WrongAnswer(f"it answered for batch {seq}, {owner}")
 
     def receive(
         self,
@@ -413,7 +413,7 @@ class Ledger:
             return None
         job, received = batch.job, batch.received
         if job is not None:
-            self._did(job, count)
+            self._add_done(job, count)
             job.pace.observe(count, seconds)
         if kept is not None:
             self._cut_short(batch, kept)
@@ -421,7 +421,7 @@ class Ledger:
             self._close_batch(batch, now)
         if job is None:
             return None
-        self._finish(job)
+        self._drop_if_finished(job)
         return Receipt(job, batch.start + offset, count, batch)
 
     def _cut_short(self, batch: Batch, kept: int) -> None:
@@ -432,19 +432,19 @@ class Ledger:
         if batch.worker.left is not None:
             batch.worker.left += units - batch.units
         if batch.job is not None:
-            self._return(batch.job, rest)
+            self._requeue(batch.job, rest)
 
     def _close_batch(self, batch: Batch, now: float) -> None:
-        self._drop(batch)
+        self._end_batch(batch)
         worker = batch.worker
         if worker.queue[0] is batch:
             worker.since = now
         worker.queue.remove(batch)
         self._load.sort(worker)
 
-    def _drop(self, batch: Batch) -> None:
+    def _end_batch(self, batch: Batch) -> None:
         del self.batches[batch.seq]
-        batch.worker.had.append(batch.seq)
+        batch.worker.ended_seqs.append(batch.seq)
         self._cancelled.discard(batch)
         if batch.job is not None:
             batch.job.batches.pop(batch, None)
@@ -459,30 +459,30 @@ class Ledger:
         if job not in self.jobs:  # the job was finished by this task
             self.jobs.add(job)
             self._open_tasks += job.fed - job.done
-        self._did(job, -1)
+        self._add_done(job, -1)
         span = Span(index, [receipt.item(index)], True, receipt.batch.pin)
         if span.pin:
             self._pin(job, receipt.batch.worker, span)
         else:
-            self._return(job, span)
+            self._requeue(job, span)
         return True
 
     def put_back(self, worker: WorkerEntry, seqs: Iterable[int], now: float) -> None:
         """Take back batches that ``worker`` never read: the answer to a recall."""
         worker.recalled = False
         held = (self.batches.get(seq) for seq in seqs)
-        mine = [batch for batch in held if batch is not None and batch.worker is worker]
-        for batch in sorted(mine, key=_by_seq, reverse=True):
+        unread = [batch for batch in held if batch is not None and batch.worker is worker]
+        for batch in sorted(unread, key=_by_seq, reverse=True):
             self._withdraw(batch, now)
             if batch.job is not None:
-                self._return(batch.job, batch.rest())
+                self._requeue(batch.job, batch.rest())
         if len(worker.queue) > 1:
             self._load.sort(worker)
 
     def drop_waiting(self, job: Job, wanted: Callable[[Any], bool]) -> None:
         """Count waiting tasks that are no longer ``wanted`` as done."""
-        self._did(job, job.drop_waiting(wanted))
-        self._finish(job)
+        self._add_done(job, job.drop_waiting(wanted))
+        self._drop_if_finished(job)
 
     def split(self, seq: int, now: float) -> Receipt | None:
         """Queue the tasks of a batch again, to be sent one by one: its worker cannot unpickle it.
@@ -497,7 +497,7 @@ class Ledger:
         self._withdraw(batch, now)
         if batch.job is not None:
             for span in reversed(batch.rest().singly()):
-                self._return(batch.job, span)
+                self._requeue(batch.job, span)
         return None
 
     def expire(self, seq: int) -> Receipt | None:
@@ -513,8 +513,8 @@ class Ledger:
         if job is None:
             return None
         job.batches.pop(batch, None)
-        self._did(job, 1)
-        self._finish(job)
+        self._add_done(job, 1)
+        self._drop_if_finished(job)
         return Receipt(job, batch.start, 1, batch)
 
     def recall(self, now: float) -> list[WorkerEntry]:
@@ -527,7 +527,7 @@ class Ledger:
         """Return the time of the next recall, if no event comes before; None if there is none."""
         return self._load.next_recall()
 
-    # Losing
+    # Deaths of workers
 
     def lose(
         self,
@@ -544,12 +544,12 @@ class Ledger:
         """
         self.workers.discard(worker)
         self._end_lease(worker)
-        guilty = worker.in_progress(set(unread), running)
+        in_progress = worker.in_progress(set(unread), running)
         losses: list[Loss] = []
         for batch in sorted(worker.queue, key=_by_seq, reverse=True):
-            self._drop(batch)
+            self._end_batch(batch)
             if batch.job is not None:
-                suspects = batch.suspects(running) if batch is guilty else range(0)
+                suspects = batch.suspects(running) if batch is in_progress else range(0)
                 again, lost = batch.job.lose(batch.rest(), suspects, disrupted=disrupted)
                 losses += lost
                 self._run_again(batch.job, again, len(lost))
@@ -558,22 +558,23 @@ class Ledger:
         self._load.spent.pop(worker, None)
         return losses[::-1]
 
-    def _run_again(self, job: Job, spans: list[Span], given_up: int) -> None:
-        self._did(job, given_up)
+    def _run_again(self, job: Job, spans: list[Span], lost_tasks: int) -> None:
+        self._add_done(job, lost_tasks)
         for span in spans:
             if span.pin:
                 self._unassigned_pins.append((job, span))
             else:
-                self._return(job, span)
-        self._finish(job)
+                self._requeue(job, span)
+        self._drop_if_finished(job)
 
-    # Inside
+    # Steps of the methods above
 
-    def _fed(self, job: Job, tasks: int) -> None:
+    def _add_fed(self, job: Job, tasks: int) -> None:
         job.fed += tasks
         self._open_tasks += tasks
 
-    def _did(self, job: Job, tasks: int) -> None:
+    def _add_done(self, job: Job, tasks: int) -> None:
+        """Count tasks of the job that are done (negative: that run again)."""
         job.done += tasks
         if job in self.jobs:
             self._open_tasks -= tasks
@@ -583,16 +584,16 @@ class Ledger:
             batch.worker.left += batch.units
         self._close_batch(batch, now)
 
-    def _return(self, job: Job, span: Span) -> None:
+    def _requeue(self, job: Job, span: Span) -> None:
         job.waiting.appendleft(span)
-        self._list(job)
+        self._give_turn(job)
 
-    def _list(self, job: Job) -> None:
+    def _give_turn(self, job: Job) -> None:
         if not job.listed:
             job.listed = True
             self._turns.append(job)
 
-    def _finish(self, job: Job) -> bool:
+    def _drop_if_finished(self, job: Job) -> bool:
         if job.finished:
             self.jobs.discard(job)
             self._paused.discard(job)

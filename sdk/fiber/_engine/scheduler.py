@@ -282,7 +282,7 @@ class Scheduler:
 
     def lease(self, worker: WorkerEntry) -> bool:
         """Lease an idle worker to callers; return False if it is needed, or not idle."""
-        return not (self.closing or self.ledger.waits()) and self.ledger.lease(worker)
+        return not (self.closing or self.ledger.has_assignable()) and self.ledger.lease(worker)
 
     def return_idle(self, worker: WorkerEntry, now: float) -> None:
         """Take back a leased worker, which is idle."""
@@ -337,7 +337,7 @@ class Scheduler:
 
     def needs_leased(self) -> bool:
         """Return whether the pool needs the leased workers that no caller uses at the moment."""
-        return bool(self.ledger.leased) and (self.closing or self.ledger.waits())
+        return bool(self.ledger.leased) and (self.closing or self.ledger.has_assignable())
 
     def _demand(self) -> int:
         return self.ledger.demand() + self.ledger.leased

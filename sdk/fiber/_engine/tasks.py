@@ -26,7 +26,7 @@ COMPACT = 1024
 RunningTask = tuple[int, int]
 """Task that a worker runs: the number of its batch, and its offset in the batch."""
 
-HAD = 16
+ENDED_SEQS = 16
 """Number of finished batches that a worker may still answer for."""
 
 RECALL_AFTER = 2e-3
@@ -379,13 +379,23 @@ class Batch:
 class WorkerEntry:
     """Batches of one worker.  ``left``: units that it may still get (maxtasksperchild)."""
 
-    __slots__ = ("had", "key", "leased", "leaving", "left", "pinned", "queue", "recalled", "since")
+    __slots__ = (
+        "ended_seqs",
+        "key",
+        "leased",
+        "leaving",
+        "left",
+        "pinned",
+        "queue",
+        "recalled",
+        "since",
+    )
 
     def __init__(self, key: Any, left: int | None) -> None:
         self.key = key
         self.left = left
         self.queue: deque[Batch] = deque()
-        self.had: deque[int] = deque(maxlen=HAD)  # batches that are over
+        self.ended_seqs: deque[int] = deque(maxlen=ENDED_SEQS)  # of its batches that are over
         self.pinned: deque[tuple[Job, Span]] = deque()
         self.since = 0.0  # time when it became idle, or began its current batch
         self.recalled = False

@@ -42,14 +42,14 @@ from fiber._wire import packet
 from fiber._wire.packet import Message
 from fiber.errors import ConnectionClosed
 
-_LOOK_FOR_THE_DEAD = 1.0
+_DEAD_CHECK_AFTER = 1.0
 """Seconds that ``put`` waits before it looks for dead processes."""
 
-_COUNT_AGAIN = 0.2
+_SURPLUS_CHECK_INTERVAL = 0.2
 """Seconds between two checks for surplus slots."""
 
-_MOVE = 1e-4
-"""Seconds between two looks while an item moves from one count to the other."""
+_TRANSFER_POLL_INTERVAL = 1e-4
+"""Seconds between two reads of the counts while an item goes from one count to the other."""
 
 
 class QueueSlots:
@@ -70,14 +70,14 @@ class QueueSlots:
         """Take a slot for an item and note it in ``taken``; False if none gets free in time."""
         now = time.monotonic()
         if now > self._next_count:
-            self._next_count = now + _COUNT_AGAIN
+            self._next_count = now + _SURPLUS_CHECK_INTERVAL
             self._remove_excess()
         deadline = math.inf if timeout is None else now + timeout
         while True:
             left = deadline - time.monotonic()
-            if self._free.claim(min(left, _LOOK_FOR_THE_DEAD), taken, self._claims):
+            if self._free.claim(min(left, _DEAD_CHECK_AFTER), taken, self._claims):
                 return True
-            if not self._recover() and left <= _LOOK_FOR_THE_DEAD:
+            if not self._recover() and left <= _DEAD_CHECK_AFTER:
                 return False
 
     def give_back(self) -> None:
@@ -105,7 +105,7 @@ class QueueSlots:
         return max(0, self._maximum - self._free.value())
 
     def full(self) -> bool:
-        """Tell whether no slot is free."""
+        """Return True if no slot is free."""
         return not self._free.wait(0) and not self._recover()
 
     def _recover(self) -> bool:
@@ -197,10 +197,12 @@ class Feeder:
         self._wake: SimpleQueue[bool] = SimpleQueue()
         self._sending = False
         self._thread = 0
-        self._moves = 0  # odd while an item moves, and may be in neither count
-        # Holds one entry while no thread feeds.  A thread takes it out before it feeds.  A caller
-        # that finds it starts a thread.  If two callers do, the second thread ends.
-        self._vacancy = [True]
+        # Raised before and after an item goes from ``_unsent`` into the count of ``_slots``.  While
+        # it is odd, the item may be in neither count.
+        self._transfer_steps = 0
+        # Has one element while no thread runs.  A caller that sees it starts a thread, which takes
+        # it.  If two callers start a thread, the second thread finds no element and ends.
+        self._no_thread = [True]
         self._joins: list[util.Finalize] = []
         self._join_cancelled = False
 
@@ -209,28 +211,28 @@ class Feeder:
 
         ``taken`` notes the item's slot.  It is emptied once the feeder is to free the slot.
         """
-        # In this order: before the feeder takes an item out, it notes that it is sending.
-        nothing_to_overtake = not self._unsent and not self._sending
-        if nothing_to_overtake and self._outbox.can_try_send and self._send_now(payload, buffers):
+        # Read ``_unsent`` first: the feeder sets ``_sending`` before it takes an item out.
+        may_send_now = not self._unsent and not self._sending
+        if may_send_now and self._outbox.can_try_send and self._send_now(payload, buffers):
             taken.clear()
             return
         # The caller may change the arrays behind the buffers when ``put`` has returned.
         taken[:] = None, (payload, packet.kept(buffers))
         self._unsent.extend(iter(taken.pop, None))  # moved in one step: no handler runs in between
         self._wake.put(True)
-        if self._vacancy:
+        if self._no_thread:
             self._start_thread()
 
     def size(self) -> int:
         """Return the number of items in the channel and in this process."""
         while True:
-            moves = self._moves
+            steps = self._transfer_steps
             size = self._slots.used(len(self._unsent))
-            none_moved = moves == self._moves and not moves % 2
-            is_feeder = threading.get_ident() == self._thread  # then it interrupted the move
-            if none_moved or is_feeder:
+            consistent = steps == self._transfer_steps and not steps % 2
+            is_feeder = threading.get_ident() == self._thread  # then it interrupts the transfer
+            if consistent or is_feeder:
                 return size
-            time.sleep(_MOVE)
+            time.sleep(_TRANSFER_POLL_INTERVAL)
 
     def _send_now(self, payload: bytes, buffers: list[memoryview]) -> bool:
         self._slots.sending()
@@ -246,10 +248,10 @@ class Feeder:
 
     def close(self) -> None:
         """Accept no more items; close the channel when all items are sent."""
-        if self._vacancy and not self._unsent:
+        if self._no_thread and not self._unsent:
             self._close_outbox()
             return
-        if self._vacancy:  # an interrupted ``put`` has not started the thread
+        if self._no_thread:  # an interrupted ``put`` has not started the thread
             self._start_thread()
         self._wake.put(False)
 
@@ -274,7 +276,7 @@ class Feeder:
 
     def _feed(self) -> None:
         try:
-            self._vacancy.pop()
+            self._no_thread.pop()
         except IndexError:
             return
         self._thread = threading.get_ident()
@@ -283,10 +285,10 @@ class Feeder:
             more = self._wake.get()
             self._sending = True
             while self._unsent:
-                self._moves += 1
+                self._transfer_steps += 1
                 item = self._unsent.popleft()
                 reachable = self._count_as_sent()
-                self._moves += 1
+                self._transfer_steps += 1
                 if reachable:
                     self._send(*item)
             self._sending = False
@@ -318,7 +320,7 @@ class Feeder:
         else:
             try:
                 self._on_error(error, None)
-            except BaseException:  # of the user's hook; other items have to be sent all the same
+            except BaseException:  # raised by the user's hook: the other items must be sent too
                 report_uncaught()
 
 
@@ -328,8 +330,8 @@ def _join(thread: weakref.ref[threading.Thread]) -> None:
         running.join()
 
 
-_LOOK = 0.2
-"""Seconds between two looks for dead processes."""
+_RECOVERY_INTERVAL = 0.2
+"""Seconds between two searches for dead processes."""
 
 
 class SlotClaims:
@@ -345,7 +347,7 @@ class SlotClaims:
 
     def __setstate__(self, state: tuple[Any, AnySemaphore]) -> None:
         self._table, self._lock = state
-        self._next_look = 0.0
+        self._next_recovery = 0.0
         self._begin()
 
     def _begin(self) -> None:
@@ -371,9 +373,9 @@ class SlotClaims:
     def recover(self, counter: SharedCounter) -> int:
         """Add the slots of dead processes to ``counter``; return their number."""
         now = time.monotonic()
-        if now < self._next_look:
+        if now < self._next_recovery:
             return 0
-        self._next_look = now + _LOOK
+        self._next_recovery = now + _RECOVERY_INTERVAL
         self._lock.acquire()
         try:
             return int(self._table.reclaim(counter))
@@ -407,8 +409,8 @@ class SlotClaims:
 
 # Dealing to readers
 
-_LOOK_AGAIN = 0.5
-"""Seconds between checks of a new reader that the dealer is alive."""
+_DEALER_CHECK_INTERVAL = 0.5
+"""Seconds between two checks by a new reader that the dealer is alive."""
 
 
 class Dealer:
@@ -433,7 +435,7 @@ class Dealer:
             while True:
                 self._wait()
                 if self._arrivals.poll(0):
-                    self._welcome()
+                    self._add_reader()
                 if self._item is None:
                     self._item = self._inbox.try_recv()
                 if self._item is not None and self._deal(self._item):
@@ -457,7 +459,7 @@ class Dealer:
                 poller.register(reader.fileno(), reader.room_events)
         poller.poll(timeout)
 
-    def _welcome(self) -> None:
+    def _add_reader(self) -> None:
         message = self._arrivals.try_recv()
         if message is None:
             return
@@ -465,18 +467,18 @@ class Dealer:
             answer: Channel = packet.loads(message)
         except Exception:  # the reader has ended already
             return
-        theirs, ours = local.one_way_pair()
+        readers_end, dealers_end = local.one_way_pair()
         with collecting_grants(reusable=False) as grants:
-            invitation = pickle.dumps(theirs)
+            invitation = pickle.dumps(readers_end)
         try:
             answer.send(invitation)
             answer.recv().release()  # the reader has its channel
-            self._readers.append(ours)
+            self._readers.append(dealers_end)
         except (OSError, ConnectionClosed):
-            ours.close()
+            dealers_end.close()
         finally:
             grants.release()
-            theirs.close()
+            readers_end.close()
             answer.close()
 
     def _deal(self, item: Message) -> bool:
@@ -494,27 +496,27 @@ class Dealer:
         return False
 
 
-def arrive(arrivals: Channel) -> Channel:
-    """Become a reader; return the channel on which the dealer sends.
+def become_reader(arrivals: Channel) -> Channel:
+    """Register with the dealer as a reader.  Return the channel on which the dealer sends.
 
-    ConnectionClosed if the dealer has ended.
+    Raises ConnectionClosed if the dealer has ended.
     """
-    ours, theirs = LocalChannel.pair()
+    own_end, dealers_end = LocalChannel.pair()
     with collecting_grants(reusable=False) as grants:
-        invitation = pickle.dumps(theirs)
-    theirs.close()
+        request = pickle.dumps(dealers_end)
+    dealers_end.close()
     try:
-        arrivals.send(invitation)
-        while not ours.poll(_LOOK_AGAIN):
-            if arrivals.poll(0):  # no message comes there, so this is the end
+        arrivals.send(request)
+        while not own_end.poll(_DEALER_CHECK_INTERVAL):
+            if arrivals.poll(0):  # the dealer sends nothing on this channel, so it has closed it
                 raise ConnectionClosed()
-        channel: Channel = ours.recv_object()
-        if isinstance(channel, RemoteObject):  # otherwise the grant might end before that
+        channel: Channel = own_end.recv_object()
+        if isinstance(channel, RemoteObject):  # attach before the grant ends
             channel.confirm()
-        ours.send(b"")
+        own_end.send(b"")
         return channel
     except BrokenPipeError as error:
         raise ConnectionClosed() from error
     finally:
         grants.release()
-        ours.close()
+        own_end.close()

@@ -343,7 +343,7 @@ class TunnelStream:
         self._forget = forget
         self._credit = WINDOW
         self._waiting: deque[tuple[TunnelData, int]] = deque()
-        self._owed = 0
+        self._consumed = 0
         self._paused = False
         self._early: deque[Message] = deque()
         self._finishing: str | None = None
@@ -410,7 +410,7 @@ class TunnelStream:
         for buffer in buffers:
             pass_on(buffer)
         self._arrived(Message(header[1:], buffers, []))
-        self._owe(_size(header, buffers))
+        self._count_consumed(_size(header, buffers))
 
     def on_close(self, reason: str) -> None:
         """Note that the other side ended the tunnel, or that the link is lost."""
@@ -429,13 +429,13 @@ class TunnelStream:
         else:
             self.handler.on_message(message)
 
-    def _owe(self, size: int) -> None:
-        self._owed += size
+    def _count_consumed(self, size: int) -> None:
+        self._consumed += size
         self._give_credit()
 
     def _give_credit(self) -> None:
-        if not self._paused and self._owed >= WINDOW // 2:
-            credit, self._owed = self._owed, 0
+        if not self._paused and self._consumed >= WINDOW // 2:
+            credit, self._consumed = self._consumed, 0
             self._send_frame(TunnelData(self._number, _KINDS[_CREDIT] + _SIZE.pack(credit)))
 
     def _pump(self) -> None:

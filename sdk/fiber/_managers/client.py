@@ -47,7 +47,7 @@ A number that a channel skips belongs to a call that was interrupted while it wa
 TAKE_BACK = "take_back"
 """Method of the server: undo the last call of a channel, whose caller was interrupted."""
 
-JOIN, OPEN_CHANNEL, INCREF, DECREF, LEAVE = "join", "line", "incref", "decref", "bye"
+JOIN, OPEN_CHANNEL, INCREF, DECREF, LEAVE = "join", "channel", "incref", "decref", "leave"
 """First words of the notices to a server.  The values are part of the wire format."""
 
 _LOOK_AGAIN = 0.5

@@ -320,7 +320,7 @@ class Link:
         silent = self._protocol.tick(self._loop.now())
         if silent >= self._keepalive.lost_after:
             broken = "" if self._connection else "the connection broke, and "
-            self._lose(f"{broken}nothing was heard for {silent:.0f} s")
+            self._lose(f"{broken}the other side was silent for {silent:.0f} s")
             return
         if silent >= self._keepalive.suspect_after and not self._suspect:
             self._suspect = True

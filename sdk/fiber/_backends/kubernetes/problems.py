@@ -129,7 +129,7 @@ def failure(pool: PoolName, status: Status, joined: int) -> FiberPoolError | Non
         )
     for problem in _problems(status):
         if problem.get("terminal") or _concerns_all(problem, status):
-            return pool.error(_told(problem), problem["reason"])
+            return pool.error(_reason_and_message(problem), problem["reason"])
     return None
 
 
@@ -140,7 +140,7 @@ def overdue(
     worst = next(_problems(status), None)
     why = f"{way.advice}." if running(status) else ""
     if not why and worst is not None:
-        why = _told(worst)
+        why = _reason_and_message(worst)
     return pool.error(
         f"no worker has joined after {waited:g} s: {summary(status, now)}. {why}".rstrip()
         + f" See kubectl describe fiberpool {pool.name} --namespace {pool.namespace}, or allow "
@@ -168,7 +168,7 @@ def _concerns_all(problem: Mapping[str, Any], status: Status) -> bool:
     return problem.get("count", 1) >= replicas if problem.get("pod") else not replicas
 
 
-def _told(problem: Mapping[str, Any]) -> str:
+def _reason_and_message(problem: Mapping[str, Any]) -> str:
     return f"{problem.get('reason')}: {problem.get('message', '')}"
 
 
