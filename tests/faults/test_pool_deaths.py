@@ -261,7 +261,7 @@ def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("_impatient")
-def test_an_initializer_that_raises_is_told_and_not_tried_for_ever(tmp_path: Path) -> None:
+def test_an_initializer_that_raises_ends_the_pool_after_few_tries(tmp_path: Path) -> None:
     path = tmp_path / "runs"
     pool = fiber.Pool(2, tasks.refuse_counted, (path,))
     with pytest.raises(StartError, match="no such device") as caught:

@@ -352,7 +352,7 @@ def acquired_elsewhere(lock: Any) -> list[bool]:
     return got
 
 
-def test_a_wait_that_was_interrupted_takes_nothing_of_its_thread(manager: Any) -> None:
+def test_an_interrupted_wait_keeps_the_lock_of_its_thread_right(manager: Any) -> None:
     condition = manager.Condition()
     with struck(TooLong):
         condition.acquire()

@@ -74,7 +74,7 @@ def test_none_is_a_result(pool: Pool) -> None:
 
 
 @pytest.mark.parametrize("source", [[], (), range(0), "", iter([])])
-def test_nothing_to_do(pool: Pool, source: Any) -> None:
+def test_maps_of_an_empty_input_return_no_results(pool: Pool, source: Any) -> None:
     assert pool.map(tasks.square, source) == []
     assert list(pool.imap(tasks.square, source)) == []
     assert pool.map_async(tasks.square, source).get(PATIENCE) == []

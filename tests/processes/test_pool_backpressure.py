@@ -74,7 +74,7 @@ def test_other_calls_go_on_meanwhile(pool: Pool) -> None:
     assert len(list(iterator)) == MANY
 
 
-def test_whoever_joins_the_pool_first_gets_all_later(pool: Pool) -> None:
+def test_results_can_all_be_read_after_the_pool_is_joined(pool: Pool) -> None:
     iterator = pool.imap(bytearray, [RESULT] * MANY)
     wait_until(lambda: _is_held_back(pool), "it is held back")
     pool.close()

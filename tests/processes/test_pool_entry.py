@@ -336,7 +336,7 @@ def test_a_pool_may_be_dropped_at_any_line_of_the_loop(pool: Pool) -> None:
         assert latch.wait(PATIENCE)
 
 
-def test_a_finalizer_on_the_loops_thread_is_refused_what_it_would_wait_for() -> None:
+def test_calls_that_wait_are_refused_to_a_finalizer_on_the_loop_thread() -> None:
     done = run_program("""
         import threading, time
         import fiber

@@ -165,7 +165,7 @@ def test_the_argument_that_does_not_pickle_is_named(pool: Pool) -> None:
 
 
 @pytest.mark.parametrize("make", ["Lock", "Queue"])
-def test_what_multiprocessing_made_is_refused_with_what_to_do(pool: Pool, make: str) -> None:
+def test_objects_of_multiprocessing_are_refused_with_advice(pool: Pool, make: str) -> None:
     theirs = getattr(multiprocessing, make)()
     for call in (
         lambda: pool.apply(tasks.identity, (theirs,)),
@@ -214,7 +214,7 @@ class Unreadable:
     ],
     ids=["a call", "a function", "items"],
 )
-def test_of_what_cannot_be_sent_results_hear_on_the_loop_as_of_all_else(
+def test_the_error_of_an_unpicklable_task_reaches_its_callback_from_the_loop_thread(
     pool: Pool,
     ask: Callable[[Pool, Callable[[Any], None]], AsyncResult],
     monkeypatch: pytest.MonkeyPatch,
@@ -288,7 +288,7 @@ def test_error_handling_retries_any_exception_within_bounds(tmp_path: Any) -> No
     pool.join()
 
 
-def test_without_retries_nothing_runs_twice(tmp_path: Any) -> None:
+def test_without_retries_a_failed_task_runs_once(tmp_path: Any) -> None:
     with fiber.Pool(1, error_handling=True, retries=0) as pool:
         with pytest.raises(KeyError, match="always"):
             pool.apply(tasks.counted_error, (tmp_path / "c",))

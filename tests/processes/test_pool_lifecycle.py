@@ -366,7 +366,7 @@ def test_a_pool_follows_the_work(tmp_path: Path) -> None:
     pool.join()
 
 
-def test_it_grows_for_what_is_read_later(tmp_path: Path) -> None:
+def test_an_empty_pool_grows_for_an_iterator_that_is_read_later(tmp_path: Path) -> None:
     path, gate = tmp_path / "here", tmp_path / "gate"
     with fiber.Pool(min_workers=0, max_workers=3) as pool:
         assert pool._pool == []
@@ -379,7 +379,7 @@ def test_it_grows_for_what_is_read_later(tmp_path: Path) -> None:
     pool.join()
 
 
-def test_a_pool_may_have_nobody(tmp_path: Path) -> None:
+def test_a_pool_shrinks_to_no_workers_between_tasks(tmp_path: Path) -> None:
     with fiber.Pool(min_workers=0, max_workers=2, idle_timeout=0.05) as pool:
         assert pool.broadcast(tasks.pid) == []
         for _ in range(3):

@@ -52,7 +52,7 @@ def test_a_wait_for_the_same_pool_is_refused(ask: Callable[[Pool], Any]) -> None
     pool.join()
 
 
-def test_what_is_there_already_may_be_asked_for() -> None:
+def test_the_pickling_thread_may_get_a_result_that_is_ready() -> None:
     with fiber.Pool(1) as pool:
         result = pool.apply_async(abs, (-1,))
         result.wait(PATIENCE)

@@ -104,7 +104,7 @@ def test_threads_that_survive_a_fork_are_reported_once(
     assert capfd.readouterr().err == "", "the program's first zygote has said it"
 
 
-def test_the_next_zygote_imports_all_up_to_what_starts_threads(
+def test_the_next_zygote_gets_the_imports_before_the_first_that_starts_threads(
     progress_table: ProgressTable, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     log = tmp_path / "log"

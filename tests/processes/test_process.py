@@ -99,7 +99,7 @@ def test_a_lambda_and_a_closure_can_be_targets(pipe: tuple[Any, Any]) -> None:
 
 
 @pytest.mark.parametrize("target", [threading.Lock(), (item for item in ())])
-def test_what_does_not_pickle_is_refused_at_the_start_and_leaks_nothing(
+def test_an_unpicklable_argument_is_refused_at_the_start_and_leaks_no_file(
     target: Any, pipe: tuple[Any, Any]
 ) -> None:
     before = open_files()
@@ -125,7 +125,7 @@ def test_an_argument_that_does_not_pickle_is_named(options: dict[str, Any], culp
 
 
 @pytest.mark.parametrize("make", ["Lock", "Queue"])
-def test_what_multiprocessing_made_is_refused_with_what_to_do(make: str) -> None:
+def test_objects_of_multiprocessing_are_refused_with_advice(make: str) -> None:
     """multiprocessing's own error is about start methods, which are not the reason."""
     theirs = getattr(multiprocessing.get_context("fork"), make)()
     with pytest.raises(UnpicklableError, match=r"fiber\.adopt\(\)") as caught:

@@ -173,7 +173,7 @@ def test_threads_keep_their_own_order() -> None:
         assert [number for who, number in items if who == name] == list(range(1000))
 
 
-def test_what_is_put_is_what_arrives_whatever_becomes_of_it() -> None:
+def test_an_item_arrives_as_it_was_when_it_was_put() -> None:
     queue: Any = fiber.Queue()
     array = np.arange(100_000)
     items = 400  # most of them have to wait: each takes a descriptor on its way
@@ -196,7 +196,7 @@ def test_an_item_that_does_not_pickle_is_reported(capsys: pytest.CaptureFixture[
     assert queue.get() == "next"
 
 
-def test_so_is_what_of_it_does_not(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_unpicklable_part_of_an_item_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     queue: Any = fiber.Queue()
     queue.put({"a": threading.Lock()})
     assert "the item cannot be pickled (at ['a'])" in capsys.readouterr().err
@@ -265,7 +265,7 @@ def test_classes_take_item_types() -> None:
         assert kind[int].__origin__ is kind
 
 
-def test_nothing_is_waited_for_that_nobody_can_read() -> None:
+def test_join_thread_does_not_wait_for_items_without_a_reader() -> None:
     queue = fiber.Queue()
     for _ in range(MORE_THAN_FITS):
         queue.put(b"x" * 100)
@@ -296,7 +296,7 @@ def get_all(queue: Any, answers: Any) -> None:
         answers.put((os.getpid(), item))
 
 
-def test_what_a_process_put_arrives_although_it_has_ended() -> None:
+def test_items_of_a_process_that_has_ended_arrive() -> None:
     queue: Any = fiber.Queue()
     process = start(put_all, queue, 0, MORE_THAN_FITS)
     assert [queue.get(timeout=PATIENCE) for _ in range(MORE_THAN_FITS)] == [*range(MORE_THAN_FITS)]
@@ -501,7 +501,9 @@ def test_task_done_once_too_often() -> None:
         queue.task_done()
 
 
-def test_what_could_not_be_put_is_no_unfinished_task(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unpicklable_item_does_not_count_as_an_unfinished_task(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     queue: Any = fiber.JoinableQueue()
     queue.put(Unpicklable())
     queue.join()

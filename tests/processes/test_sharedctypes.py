@@ -122,7 +122,7 @@ def test_values_of_a_context() -> None:
 # In other processes
 
 
-def test_processes_share_what_they_are_given() -> None:
+def test_processes_share_values_and_arrays_of_their_arguments() -> None:
     value, array = fiber.Value("i", 0), fiber.RawArray("d", 100_000)
     processes = [start(count_up, value, 100) for _ in range(3)] + [start(fill, array, 1)]
     for process in processes:

@@ -184,7 +184,7 @@ def test_a_session_has_its_working_directory(site: Site) -> None:
     assert site.prints("-c", SESSION) == ["es True"]
 
 
-def test_a_session_in_a_folder_that_is_too_large_goes_on_with_what_it_imported(site: Site) -> None:
+def test_a_session_in_a_folder_that_is_too_large_sends_its_imported_modules(site: Site) -> None:
     write(site.program, helper_py="", large_npy=bytes(2 << 20))
     limit = "from fiber._backends import program_files; program_files.LIMIT = 1 << 20\n"
     done = site.run("-c", f"{limit}import helper\n{SESSION}")
@@ -194,7 +194,7 @@ def test_a_session_in_a_folder_that_is_too_large_goes_on_with_what_it_imported(s
     assert "only imported modules of the working directory" in done.stderr
 
 
-def test_a_script_in_a_home_directory_goes_on_with_what_it_imported(
+def test_a_script_in_a_home_directory_sends_its_imported_modules(
     site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("HOME", str(site.program))
@@ -248,7 +248,7 @@ if __name__ == "__main__":
     assert "for example '!/server.key'. The line '/server.key' leaves it out" in done.stderr
 
 
-def test_a_listing_shows_what_goes_and_what_does_not(site: Site) -> None:
+def test_a_listing_shows_sent_and_left_out_files_with_reasons(site: Site) -> None:
     write(site.program, server_key="key", notes_log="log", data_txt="text")
     (site.program / ".gitignore").write_text("*.log\n")
     program = """
@@ -347,7 +347,7 @@ if __name__ == "__main__":
     assert done.stderr.count(f"  {site.program}/results.csv") == 1
 
 
-def test_a_script_whose_folder_is_too_large_is_told_at_once(site: Site) -> None:
+def test_a_script_whose_folder_is_too_large_fails_at_its_first_start(site: Site) -> None:
     write(site.program, large_npy=bytes(2 << 20))
     program = """
 import elsewhere, fiber
@@ -367,7 +367,7 @@ if __name__ == "__main__":
     assert all(line.startswith(f"ProgramTooLarge {{'{path}': '2.0 MiB'") for line in lines)
 
 
-def test_what_keeps_files_from_being_unpacked_is_said(site: Site) -> None:
+def test_an_archive_that_cannot_be_unpacked_is_an_error_of_the_start(site: Site) -> None:
     program = """
 import elsewhere, fiber
 from fiber._backends import shipping

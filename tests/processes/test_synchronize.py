@@ -79,7 +79,7 @@ def test_a_wrong_number_is_refused_as_by_multiprocessing(name: str, value: Any) 
     assert refusal(getattr(fiber, name), value) is expected
 
 
-def test_to_notify_fewer_than_none_wakes_nobody() -> None:
+def test_a_notify_with_a_negative_number_wakes_no_thread() -> None:
     condition = fiber.Condition()
     with condition:
         condition.notify(-1)

@@ -187,7 +187,7 @@ def test_an_environment_that_cannot_be_made_or_pickled() -> None:
         VectorEnv([Faulty, lambda: generator], num_workers=2)  # type: ignore[list-item]
 
 
-def test_workers_share_what_they_do_not_divide(vector_env: Make) -> None:
+def test_environments_are_distributed_evenly_over_the_workers(vector_env: Make) -> None:
     env = vector_env([Faulty] * 5, num_workers=3)
     pids = env.call("pid")
     assert [pids.count(pid) for pid in dict.fromkeys(pids)] == [1, 2, 2]

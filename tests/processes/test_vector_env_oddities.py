@@ -86,7 +86,7 @@ def test_an_answer_that_cannot_be_unpickled(
     assert env.reset()[0].tolist() == [[0]] * 4
 
 
-def test_what_its_worker_says_later_is_not_taken_for_the_next_answer(
+def test_a_late_answer_of_a_failed_worker_is_not_taken_for_the_next_answer(
     vector_env: Make, tmp_path: Path
 ) -> None:
     gate = tmp_path / "gate"
@@ -135,7 +135,7 @@ def is_its_owners(array: Any) -> bool:
     return not isinstance(memory.obj if isinstance(memory, memoryview) else memory, mmap.mmap)
 
 
-def test_what_is_large_is_the_users_own(vector_env: Make) -> None:
+def test_large_arrays_belong_to_the_user_and_are_writable(vector_env: Make) -> None:
     env = vector_env([Filming] * 2, autoreset_mode="SameStep", copy=False)
     env.reset()
     observations, *_, infos = env.step([0, 0])

@@ -113,7 +113,7 @@ def test_a_callback_may_wait_for_other_futures(
     assert later.result(PATIENCE)  # one callback after the other
 
 
-def test_what_is_pickled_or_unpickled_cannot_wait_for_the_same_executor(
+def test_pickling_and_unpickling_cannot_wait_for_results_of_the_same_executor(
     executor: fiber.Executor, tmp_path: Path
 ) -> None:
     gate = tmp_path / "gate"

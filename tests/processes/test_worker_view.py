@@ -54,13 +54,13 @@ def test_workers_that_do_not_come_in_time_are_counted() -> None:
 
 
 @pytest.mark.slow
-def test_what_keeps_workers_from_starting_is_raised() -> None:
+def test_the_error_of_an_initializer_is_raised_to_a_caller_that_waits_for_workers() -> None:
     with fiber.Pool(1, fail) as pool, pytest.raises(StartError, match="no such device"):
         pool.wait_until_workers_up(PATIENCE)
     pool.join()
 
 
-def test_the_first_function_decides_what_workers_get() -> None:
+def test_the_first_function_decides_the_resources_of_the_workers() -> None:
     resources = WorkerResources(Resources(pool="warm"))
     resources.choose_for(fiber.meta(cpu=2)(square))
     assert resources.chosen == Resources(cpu=2, pool="warm")

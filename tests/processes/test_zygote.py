@@ -395,7 +395,7 @@ def test_a_refused_fork_is_reported_and_leaks_no_descriptor(
     assert signal.pthread_sigmask(signal.SIG_BLOCK, []) == set()
 
 
-def test_a_request_for_which_it_has_no_descriptors_is_told_and_does_not_end_it(
+def test_a_zygote_without_free_descriptors_reports_the_request_as_failed_and_lives(
     inside: tuple[zygote.Zygote, socket.socket],
 ) -> None:
     made, ours = inside
@@ -430,7 +430,7 @@ def test_a_child_out_of_reach_does_not_end_the_others(
     child.returncode = 0
 
 
-def test_what_came_ahead_of_a_start_that_never_came_is_closed(master: Master) -> None:
+def test_descriptors_of_a_start_that_never_came_are_closed(master: Master) -> None:
     reader, writer = os.pipe()
     packet.send(master.sock, pickle.dumps((zygote.DESCRIPTORS, 1)), fds=[writer])
     os.close(writer)
@@ -491,7 +491,7 @@ def test_one_that_was_started_early_is_the_next_one(progress_table: ProgressTabl
     master.close()
 
 
-def test_one_that_nobody_came_for_is_ended() -> None:
+def test_an_unused_early_zygote_is_ended() -> None:
     zygote_process.start_early()
     assert zygote_process._early is not None
     pid = zygote_process._early.process.pid

@@ -48,7 +48,7 @@ def test_an_agent_that_is_not_drained_ends_soon(agent: Main) -> None:
 
 
 @pytest.mark.parametrize("planted", ["pipe", "link"])
-def test_what_a_task_puts_in_place_of_the_mark_does_not_hold_up_the_agent(
+def test_a_pipe_or_link_in_place_of_the_ready_file_does_not_block_the_agent(
     agent: Main, tmp_path: Path, planted: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
     mark = tmp_path / "linked"

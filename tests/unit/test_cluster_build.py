@@ -108,7 +108,7 @@ WHOLE = ["helm", "packages", "kubernetes", "helm", "pause", "images"]
     ],
     ids=["own-cluster", "given-cluster", "no-root", "no-network"],
 )
-def test_preparation_does_what_the_machine_can_and_never_fails(
+def test_preparation_runs_the_possible_steps_and_never_fails(
     monkeypatch: pytest.MonkeyPatch,
     kubeconfig: str,
     obstacles: list[str],

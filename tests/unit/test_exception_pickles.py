@@ -193,7 +193,7 @@ def test_one_whose_class_is_local_to_a_function() -> None:
     assert (type(found).__name__, found.args, found.step) == ("Local", ("local",), 3)
 
 
-def test_what_cannot_travel_is_left_out_with_a_note() -> None:
+def test_unpicklable_parts_of_an_exception_are_replaced_by_notes() -> None:
     error = kinds.Wraps(kinds.Holding(3), step=2)
     error.add_note("on the device")
     found = travelled(error)
@@ -243,7 +243,7 @@ def test_each_reduce_that_fails_is_tried_once() -> None:
     assert part.attempts < 5 * length
 
 
-def test_what_cannot_be_made_again_says_why() -> None:
+def test_an_exception_that_cannot_be_rebuilt_becomes_a_maybe_encoding_error() -> None:
     error = kinds.Hopeless("no hope")
     error.step = 3  # type: ignore[attr-defined]
     found = travelled(error)
@@ -261,7 +261,7 @@ def test_one_whose_attributes_raise_says_so() -> None:
     assert "in travelled" in str(found.__cause__)
 
 
-def test_what_only_its_receiver_cannot_unpickle_says_so_and_where_it_was(
+def test_an_exception_that_the_receiver_cannot_unpickle_names_its_error_and_traceback(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     data = encode_error(kinds.Diverged(3, loss=0.5))
@@ -291,7 +291,7 @@ def test_causes_and_contexts_come_behind_the_traceback() -> None:
     assert (type(diverged.__cause__), diverged.__cause__.step) == (kinds.BadlyReduced, 1)
 
 
-def test_what_its_frames_hold_goes_at_once() -> None:
+def test_encoding_an_exception_frees_the_objects_of_its_frames() -> None:
     def fail(held: object) -> bytes:
         try:
             raise kinds.Holding(3)

@@ -86,7 +86,7 @@ def test_paths_are_the_apis() -> None:
 # -- Logging in
 
 
-def test_the_current_context_says_where_and_who(server: Served, api: Api) -> None:
+def test_the_current_context_gives_namespace_server_and_token(server: Served, api: Api) -> None:
     assert (api.namespace, api.in_cluster, api.server) == (NAMESPACE, False, "127.0.0.1")
     api.list(ALL)
     assert server.api.tokens == ["Bearer one"]

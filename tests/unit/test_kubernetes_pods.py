@@ -337,7 +337,7 @@ def test_an_agent_that_began_anew_is_let_in_and_its_pod_stays(site: Site) -> Non
     ],
     ids=["process", "pool"],
 )
-def test_a_process_that_waits_for_one_more_pod_is_told_the_reason(
+def test_only_a_waiting_process_prints_why_one_more_pod_is_missing(
     worker: bool, told: list[str], site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A pool works with what it has; nothing else can do what a process is to do."""

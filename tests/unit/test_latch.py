@@ -225,7 +225,7 @@ def test_a_signal_that_did_not_wake_the_waiting_thread_is_not_slept_over() -> No
 
 
 @pytest.mark.usefixtures("_signals_raise")
-def test_nor_is_it_by_a_thread_that_reads_what_a_pool_is_to_do() -> None:
+def test_a_signal_interrupts_a_thread_that_reads_the_input_of_a_pool() -> None:
     stream = InputStream(1, lambda: None)
     reads, over = threading.Event(), threading.Event()
     struck = list[bool]()

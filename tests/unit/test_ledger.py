@@ -105,7 +105,7 @@ def test_a_job_that_needs_an_idle_worker_gets_one(needs: str) -> None:
     assert given.count(big) >= 2
 
 
-def test_what_starting_workers_can_do_does_not_queue() -> None:
+def test_tasks_that_starting_workers_can_run_do_not_queue() -> None:
     ledger, _ = ledger_with(1)
     ledger.starting = 3
     job_of(ledger, range(4))

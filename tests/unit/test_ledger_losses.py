@@ -293,7 +293,7 @@ def test_demand_counts_no_tasks_that_wait_until_results_are_read() -> None:
     assert ledger.demand() == 0
 
 
-def test_tasks_that_come_back_to_a_paused_job_take_none_along_that_nobody_was_given() -> None:
+def test_a_paused_job_assigns_only_tasks_that_came_back() -> None:
     ledger, _ = ledger_with(2)
     job = ledger.open(pace=known(SLOW / 10))
     ledger.feed(job, ["a", "b"])

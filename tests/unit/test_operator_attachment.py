@@ -61,7 +61,7 @@ def test_a_release_below_the_minimum_changes_no_pod() -> None:
     assert set(gone(made)) < set(names(1, 2))
 
 
-def test_a_release_goes_where_the_minimum_is_not_what_keeps_the_worker() -> None:
+def test_a_released_worker_is_deleted_unless_only_the_minimum_keeps_it() -> None:
     release = {"release": [name_of(1)]}
     wanted = tried(replicas=3, minReplicas=3, master=MASTER, scaleDown=release)
     made = plan_of(wanted, running(1), running(2), running(3))

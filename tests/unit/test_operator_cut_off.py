@@ -77,7 +77,9 @@ async def test_a_service_of_one_family_that_is_deleted_gets_the_other_for_its_ma
         ("", "10.96.0.2"),
     ],
 )
-def test_the_address_is_what_the_status_says_if_that_is_one(endpoint: str, address: str) -> None:
+def test_a_lost_service_gets_the_address_of_the_status_if_it_is_valid(
+    endpoint: str, address: str
+) -> None:
     @played
     async def test(world: World) -> None:
         world.make_pool()

@@ -233,7 +233,9 @@ def test_without_the_right_to_list_pools_the_operator_is_not_ready() -> None:
 
 
 @played
-async def test_a_master_that_is_not_led_to_is_not_told_as_if_it_were(world: World) -> None:
+async def test_the_status_names_a_new_master_only_when_the_endpoint_slice_leads_to_it(
+    world: World,
+) -> None:
     world.make_pool(replicas=3, master=MASTER)
     await world.ready(3)
     world.api.faults.append(denied(("patch", "endpointslices")))

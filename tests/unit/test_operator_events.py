@@ -87,7 +87,7 @@ def test_output_of_a_worker_is_in_the_status_alone(limit: int) -> None:
     assert "password" not in str(made.events)
 
 
-def test_what_a_worker_wrote_is_not_why_it_was_disrupted() -> None:
+def test_the_event_of_a_disruption_leaves_out_the_message_of_the_worker() -> None:
     evicted = condition("DisruptionTarget", "True", reason="PreemptionByScheduler")
     made, _ = look(make_pool(replicas=1), ended(1, message="password: 1", conditions=[evicted]))
     assert "Disrupted" in reasons(made)

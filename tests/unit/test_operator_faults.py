@@ -182,7 +182,9 @@ def test_an_answer_that_is_not_the_pool_changes_no_pod(text: str) -> None:
 
 
 @played
-async def test_a_status_that_cannot_be_written_holds_back_what_it_must_tell(world: World) -> None:
+async def test_failed_pods_are_kept_until_the_status_that_counts_them_is_written(
+    world: World,
+) -> None:
     """A failed pod is deleted only once its failure is safely counted."""
     world.make_pool(replicas=8, failurePolicy={"backoffBaseSeconds": 1, "backoffLimit": 100})
     await world.ready(8)
@@ -376,7 +378,7 @@ def test_no_worker_of_a_master_that_attaches_during_a_look_is_deleted(
 
 
 @played
-async def test_a_master_that_attaches_during_a_long_deletion_keeps_who_is_left(
+async def test_a_master_that_attaches_during_a_long_deletion_keeps_the_remaining_workers(
     world: World,
 ) -> None:
     """Each batch is begun only while the pool is the one that the plan was made for."""

@@ -121,7 +121,7 @@ async def test_one_that_renews_is_alive(watch: Watch) -> None:
 
 
 @played
-async def test_what_it_says_of_its_agents_counts_from_its_first_renewal_on(watch: Watch) -> None:
+async def test_the_number_of_agents_in_a_lease_counts_from_its_first_renewal(watch: Watch) -> None:
     """Before that it may be the word of the last master."""
     watch.write(connected="7")
     watch.monitor.follow(ES, LEASE)
@@ -325,7 +325,7 @@ async def test_another_epoch_is_another_master(watch: Watch) -> None:
 
 
 @played
-async def test_nobody_is_watched_for_nothing(watch: Watch) -> None:
+async def test_a_pool_without_a_lease_causes_no_reads(watch: Watch) -> None:
     watch.monitor.follow(ES, LEASE)
     await asyncio.sleep(21)
     assert watch.monitor.follow(ES, None) == LeaseVerdict()

@@ -85,12 +85,12 @@ def test_of_one_second_the_event_that_was_written_last_is_the_newest() -> None:
 @pytest.mark.parametrize(
     "reason", ["Scheduled", "TriggeredScaleUp", "SandboxChanged", "BackOff", "Killing"]
 )
-def test_what_ends_no_trouble_does_not_hide_it(reason: str) -> None:
+def test_an_event_that_ends_no_trouble_keeps_the_warning(reason: str) -> None:
     assert warning_of(event(MOUNT, 1), event(("Normal", reason), 2)) != ""
 
 
 @pytest.mark.parametrize("reason", ["FailedScheduling", "MissingClusterDNS"])
-def test_what_keeps_no_pod_with_a_node_from_starting_is_not_told(reason: str) -> None:
+def test_a_warning_that_delays_no_start_is_ignored(reason: str) -> None:
     assert warning_of(event(("Warning", reason), 5)) == ""
 
 
@@ -133,7 +133,7 @@ def test_a_long_image_pull_after_a_late_secret_is_no_problem() -> None:
     virtual_time.run(main())
 
 
-def test_what_is_asked_of_another_pod_now_is_not_told_of_this_one_for_ever() -> None:
+def test_a_warning_of_one_pod_ends_although_another_pod_is_asked_now() -> None:
     """A warning of the second pod is not looked at again once the first one is the silent one."""
 
     async def main() -> None:

@@ -60,14 +60,14 @@ def test_a_deleted_pod_is_terminating_in_every_other_state() -> None:
     "reason",
     ["ErrImagePull", "ImagePullBackOff", "InvalidImageName", "CreateContainerConfigError"],
 )
-def test_what_the_kubelet_retries_cannot_start(reason: str) -> None:
+def test_a_pod_that_the_kubelet_retries_cannot_start(reason: str) -> None:
     pod = look(waiting(1, reason, "why"))
     assert (pod.state, pod.trouble) == (PodState.PENDING, Trouble.CANNOT_START)
     assert (pod.reason, pod.message) == (reason, "why")
 
 
 @pytest.mark.parametrize("reason", ["ContainerCreating", "PodInitializing", ""])
-def test_what_is_on_its_way_is_no_trouble(reason: str) -> None:
+def test_a_pod_that_is_starting_has_no_trouble(reason: str) -> None:
     assert look(waiting(1, reason)).trouble is None
 
 
@@ -214,7 +214,7 @@ def test_an_end_without_an_exit_code_is_none(code: Any) -> None:
 
 
 @pytest.mark.parametrize("conditions", [None, [], "x", [{"type": "Ready", "status": "Unknown"}]])
-def test_a_worker_that_runs_and_of_which_nobody_can_tell_may_have_been_ready(
+def test_a_running_worker_without_valid_conditions_may_have_been_ready(
     conditions: Any,
 ) -> None:
     pod = look({**running(), "status": {**running()["status"], "conditions": conditions}})

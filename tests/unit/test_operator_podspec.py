@@ -129,7 +129,7 @@ def test_the_init_container_names_the_pod_whatever_the_template_says() -> None:
     assert env["FIBER_AGENT_KEY"]["value"] == "/etc/fiber/key"
 
 
-def test_nothing_that_tasks_may_have_written_reaches_the_init_container() -> None:
+def test_the_init_container_gets_no_variable_or_volume_that_tasks_can_write() -> None:
     """Each of these makes Python, its loader or its shell run code from the shared volume."""
     names_of_code = ("PYTHONPATH", "PYTHONHOME", "HOME", "PATH", "LD_PRELOAD", "BASH_ENV")
     shared = {
@@ -166,7 +166,7 @@ def test_the_init_container_has_the_volume_of_the_interpreter_and_no_other() -> 
         ({"command": ["sleep", "9"], "args": ["x"]}, ["python", "-m", "fiber.agent"]),
     ],
 )
-def test_the_init_container_runs_what_the_worker_does_if_that_is_an_agent(
+def test_the_init_container_has_the_agent_command_of_the_worker(
     said: Json, command: list[str] | None
 ) -> None:
     first = first_of(said)
@@ -220,7 +220,7 @@ def test_a_pod_is_bare_and_ends_for_good() -> None:
     assert worker_of({"terminationMessagePolicy": "File"})["terminationMessagePolicy"] == "File"
 
 
-def test_metadata_is_the_users_but_for_what_makes_it_a_worker() -> None:
+def test_a_pod_keeps_the_metadata_of_the_user_except_identity_and_owner() -> None:
     metadata = {
         "name": "mine",
         "namespace": "elsewhere",
@@ -282,7 +282,7 @@ def test_one_container_may_be_root() -> None:
 @pytest.mark.parametrize(
     "own", [{"privileged": True}, {"capabilities": {"add": ["CAP_SYS_ADMIN"]}}]
 )
-def test_nothing_is_added_that_the_api_server_would_refuse_beside(own: Json) -> None:
+def test_a_security_context_gets_no_field_that_conflicts_with_the_users(own: Json) -> None:
     worker = worker_of({"securityContext": own})
     assert "allowPrivilegeEscalation" not in worker["securityContext"]
 

@@ -62,7 +62,7 @@ def test_a_pool_without_problems_says_so() -> None:
         ("PreStartHookError", "CreateContainerError", False),
     ],
 )
-def test_what_waiting_does_not_mend_is_an_error_at_once(
+def test_a_problem_that_waiting_does_not_mend_is_an_error_at_once(
     reason: str, named: str, terminal: bool
 ) -> None:
     found = problem(POOL, waiting(1, reason, 'secret "token" not found.'))
@@ -167,7 +167,7 @@ def test_a_failed_worker_shows_its_exit_code_and_its_last_lines() -> None:
         ({"reason": "StartError", "message": "no such file"}, "RunContainerError", "no such file"),
     ],
 )
-def test_an_image_that_has_no_fiber_is_told_of_the_container_that_lacks_it(
+def test_a_failed_init_container_is_named_with_the_advice_to_install_fiber(
     end: Json, reason: str, said: str
 ) -> None:
     pod = pod_document(1, phase="Failed")
@@ -202,7 +202,7 @@ def test_a_command_that_is_no_agent_is_recognized() -> None:
     assert "python -m fiber.agent" in found.message
 
 
-def test_workers_that_end_well_again_and_again_are_a_warning_that_says_what_it_means() -> None:
+def test_workers_that_exit_with_0_repeatedly_cause_one_warning_with_advice() -> None:
     pool, now = make_pool(replicas=1, master=MASTER), NOW
     for number in (1, 2):
         pod = ended(number, code=0, age=20 + NOW - now, ran=12, ago=NOW - now)
@@ -273,7 +273,7 @@ def test_failures_are_summed_up_while_they_last() -> None:
         ),
     ],
 )
-def test_a_failure_of_which_little_is_known_is_told_as_far_as_it_is(known: Json, said: str) -> None:
+def test_the_message_of_a_failure_has_the_known_fields(known: Json, said: str) -> None:
     edited = {"failures": {"waves": 2, "specHash": spec_hash(POOL), **known}}
     found = problem(then(POOL, FiberPoolStatus.model_validate(edited)))
     assert found.reason == "ContainerFailed"

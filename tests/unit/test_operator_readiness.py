@@ -193,13 +193,13 @@ def test_the_lease_of_a_live_master_says_how_many_agents_it_has() -> None:
     assert connected(pool, alive=True) is None
 
 
-def test_nobody_is_connected_to_a_master_that_is_lost_or_none() -> None:
+def test_a_pool_without_a_living_master_has_no_connected_agents() -> None:
     lost = make_pool(replicas=3, master=LEASED)
     assert connected(lost, alive=False, connected=2) == 0
     assert connected(make_pool(minReplicas=3)) == 0
 
 
-def test_without_a_lease_nobody_knows() -> None:
+def test_without_a_lease_the_number_of_connected_agents_is_unknown() -> None:
     assert connected(make_pool(replicas=3, master=MASTER)) is None
 
 

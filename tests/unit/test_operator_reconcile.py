@@ -146,7 +146,7 @@ def test_the_end_of_a_released_pod_is_no_failure() -> None:
     assert (after.total, after.disrupted) == (0, 0)
 
 
-def test_lowered_replicas_cancel_what_does_not_run_yet_newest_first() -> None:
+def test_lowered_replicas_delete_pods_that_do_not_run_yet_newest_first() -> None:
     """A worker that runs may have joined, though it was never Ready."""
     pool = tried(replicas=2, master=MASTER)
     pods = [running(1), running(2), running(3), running(4, age=9, ready=False)]
@@ -329,7 +329,7 @@ def test_fifty_of_a_hundred_drained_during_a_back_off_are_replaced_at_once() -> 
     assert with_plan(failing, made).status.failures.disrupted == 50
 
 
-def test_what_a_quota_or_the_nodes_keep_out_says_nothing_of_those_that_work() -> None:
+def test_pods_that_never_came_do_not_add_to_failures_while_others_work() -> None:
     """A pool is given up for workers that fail, not for workers that never came."""
     failures = {"consecutive": 6, "waves": 6, "nextCreateTime": format_time(NOW - 1)}
     pool = tried(replicas=10)
@@ -451,7 +451,7 @@ def test_a_lost_master_keeps_its_workers_for_its_grace(on_lost: str) -> None:
     assert status.phase == "Degraded"
 
 
-def test_what_follows_from_a_lost_master() -> None:
+def test_on_lost_decides_which_pods_outlive_a_lost_master() -> None:
     def after_grace(on_lost: str, lease: plans.LeaseVerdict = EXPIRED) -> Plan:
         pool = lost(make_pool(replicas=3, minReplicas=1, master=LEASED, onLost=on_lost), 60)
         return plan_of(pool, running(1), running(2, age=50), master=lease)

@@ -65,7 +65,7 @@ def test_only_the_template_makes_pods_outdated(spec: dict[str, Any]) -> None:
         ({"master": MASTER}, True),
     ],
 )
-def test_what_begins_anew_after_failures_is_what_the_message_names(
+def test_changes_of_the_template_or_policy_change_the_spec_hash(
     spec: dict[str, Any], anew: bool
 ) -> None:
     assert (spec_hash(make_pool(**spec)) != spec_hash(make_pool())) is anew

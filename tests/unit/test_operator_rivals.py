@@ -49,7 +49,7 @@ def test_a_pool_that_two_operators_serve_has_a_warning(caplog: pytest.LogCapture
     virtual_time.run(test())
 
 
-def test_the_next_process_of_one_release_warns_of_nothing() -> None:
+def test_the_next_process_of_one_release_gives_no_warning() -> None:
     async def test() -> None:
         async with a_world() as world:
             world.make_pool(replicas=2)

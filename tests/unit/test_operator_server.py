@@ -212,7 +212,7 @@ def test_metrics_outlive_nonsense_in_a_status(status: dict[str, Any]) -> None:
     assert PoolSample.of(status, []).desired == 0
 
 
-def test_what_the_chart_asks_for_is_what_there_is() -> None:
+def test_metrics_that_the_chart_names_exist() -> None:
     """Dashboard and alerts."""
     found = Metrics()
     found.watch_queue(Parts().health.queue.statistics, lambda: True)

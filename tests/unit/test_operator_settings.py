@@ -114,7 +114,7 @@ def test_all_invalid_settings_are_reported_at_once() -> None:
         "METRICS_PORT_8080_TCP_PROTO",
     ],
 )
-def test_what_kubernetes_says_of_services_is_no_setting(name: str) -> None:
+def test_variables_of_a_service_called_fiber_operator_are_ignored(name: str) -> None:
     """A Service called fiber-operator gives every container beside it such variables."""
     read(**{name: "tcp://10.96.0.7:8080"})
 

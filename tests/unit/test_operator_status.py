@@ -36,7 +36,7 @@ def told(status: FiberPoolStatus) -> dict[str, tuple[str, str]]:
     return {found.type: (found.status, found.reason) for found in status.conditions}
 
 
-def test_what_a_person_and_the_scale_subresource_read() -> None:
+def test_the_status_has_counts_addresses_and_the_selector() -> None:
     pool = make_pool(replicas=5, master={**MASTER, "epoch": 3})
     status = status_of(
         pool,
@@ -196,7 +196,7 @@ def test_a_damaged_status_is_written_anew() -> None:
     assert made.status["failures"]["total"] == 0
 
 
-def test_what_is_no_more_is_none_in_the_patch() -> None:
+def test_a_value_that_ended_is_none_in_the_patch() -> None:
     pool = make_pool(replicas=1)
     pool = with_plan(pool, plan_of(pool, ended(1)))
     assert pool.status.failures.next_create_time

@@ -147,7 +147,7 @@ async def test_a_pool_always_rests_between_reconciles(
 
 
 @played()
-async def test_a_lull_ends_a_rest(queue: WorkQueue, reconciler: Reconciler) -> None:
+async def test_a_pause_of_the_events_ends_a_rest(queue: WorkQueue, reconciler: Reconciler) -> None:
     reconciler.result = Result(rest=4.0, early=True)
     queue.add(A)
     await asyncio.sleep(1)
@@ -159,7 +159,9 @@ async def test_a_lull_ends_a_rest(queue: WorkQueue, reconciler: Reconciler) -> N
 
 
 @played()
-async def test_what_a_rest_lacked_is_made_up_for(queue: WorkQueue, reconciler: Reconciler) -> None:
+async def test_a_shortened_rest_makes_the_next_rest_longer(
+    queue: WorkQueue, reconciler: Reconciler
+) -> None:
     reconciler.result = Result(rest=4.0, early=True)
     queue.add(A)
     await asyncio.sleep(1)
@@ -171,7 +173,7 @@ async def test_what_a_rest_lacked_is_made_up_for(queue: WorkQueue, reconciler: R
 
 
 @played()
-async def test_while_events_do_not_cease_a_pool_rests(
+async def test_a_pool_rests_while_events_do_not_pause(
     queue: WorkQueue, reconciler: Reconciler
 ) -> None:
     reconciler.result = Result(rest=4.0, early=True)
@@ -183,7 +185,7 @@ async def test_while_events_do_not_cease_a_pool_rests(
 
 
 @played()
-async def test_no_lull_brings_a_failed_pool_back_early(
+async def test_no_pause_ends_the_rest_of_a_failed_pool(
     queue: WorkQueue, reconciler: Reconciler
 ) -> None:
     reconciler.result = Result(failed=True, rest=4.0, early=True)

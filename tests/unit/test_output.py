@@ -58,7 +58,7 @@ def numbers(stderr: Stuck) -> list[int]:
     return [int(line.split()[-1]) for line in stderr.getvalue().splitlines() if "[w]" in line]
 
 
-def test_what_a_stuck_stderr_has_no_room_for_is_left_out_and_counted(
+def test_lines_beyond_the_limit_of_a_stuck_stderr_are_left_out_and_counted(
     stderr: Stuck, lines: OutputWriter
 ) -> None:
     for number in range(1000):
@@ -71,9 +71,7 @@ def test_what_a_stuck_stderr_has_no_room_for_is_left_out_and_counted(
     assert SAID.findall(stderr.getvalue()) == [str(1000 - len(written))]
 
 
-def test_what_comes_after_a_gap_follows_what_is_said_of_it(
-    stderr: Stuck, lines: OutputWriter
-) -> None:
+def test_lines_after_a_gap_follow_the_note_about_it(stderr: Stuck, lines: OutputWriter) -> None:
     for number in range(1000):
         lines.write("w", f"line {number}")
     stderr.goes_on.set()
@@ -84,7 +82,7 @@ def test_what_comes_after_a_gap_follows_what_is_said_of_it(
     assert "left out" in stderr.getvalue().splitlines()[-2]
 
 
-def test_what_is_left_out_at_the_end_is_said_too(stderr: Stuck, lines: OutputWriter) -> None:
+def test_lines_left_out_at_the_end_are_counted_too(stderr: Stuck, lines: OutputWriter) -> None:
     for number in range(1000):
         lines.write("w", f"line {number}")
     threading.Timer(0.05, stderr.goes_on.set).start()
@@ -92,7 +90,7 @@ def test_what_is_left_out_at_the_end_is_said_too(stderr: Stuck, lines: OutputWri
     assert "left out" in stderr.getvalue().splitlines()[-1]
 
 
-def test_what_keeps_up_loses_nothing(stderr: Stuck, lines: OutputWriter) -> None:
+def test_a_stderr_that_keeps_up_gets_every_line(stderr: Stuck, lines: OutputWriter) -> None:
     stderr.goes_on.set()
     for number in range(1000):
         lines.write("w", f"line {number}")
@@ -100,7 +98,7 @@ def test_what_keeps_up_loses_nothing(stderr: Stuck, lines: OutputWriter) -> None
     assert numbers(stderr) == list(range(1000))
 
 
-def test_a_line_stands_below_what_is_written(stderr: Stuck, lines: OutputWriter) -> None:
+def test_the_progress_line_stays_below_other_lines(stderr: Stuck, lines: OutputWriter) -> None:
     stderr.goes_on.set()
     lines.show("1 of 2")
     stderr.wait_for("1 of 2")

@@ -75,7 +75,7 @@ def test_packets_stay_apart_and_in_order(pair: Pair) -> None:
     assert [packet.receive(other).tobytes() for _ in payloads] == payloads
 
 
-def test_memory_above_what_is_retained_is_the_receivers_own(pair: Pair) -> None:
+def test_memory_above_the_limit_of_reuse_belongs_to_the_receiver(pair: Pair) -> None:
     one, other = pair
     payload = bytes(RETAINED_LIMIT + 1)
     packet.send(one, payload)
@@ -87,7 +87,7 @@ def test_memory_above_what_is_retained_is_the_receivers_own(pair: Pair) -> None:
     assert message.payload[0] == 7
 
 
-def test_memory_used_again_does_not_change_what_was_received(pair: Pair) -> None:
+def test_reuse_of_memory_does_not_change_received_messages(pair: Pair) -> None:
     one, other = pair
     received = []
     for number in range(8):
@@ -199,7 +199,7 @@ def test_descriptors_that_find_no_room_are_an_error_that_says_the_limit(pair: Pa
 # Waiting, and the end
 
 
-def test_without_waiting_there_may_be_nothing(pair: Pair) -> None:
+def test_receive_without_waiting_raises_if_no_message_is_there(pair: Pair) -> None:
     one, other = pair
     with pytest.raises(BlockingIOError):
         packet.receive(other, wait=False)
@@ -259,7 +259,7 @@ def test_the_end_comes_after_the_last_packet(pair: Pair) -> None:
         packet.send(other, b"x")
 
 
-def test_what_the_peer_left_unread_does_not_hide_what_it_sent(pair: Pair) -> None:
+def test_an_unread_message_of_a_closed_peer_does_not_hide_its_own(pair: Pair) -> None:
     one, other = pair
     packet.send(other, b"never read")
     packet.send(one, b"still here")
@@ -305,7 +305,7 @@ def test_large_bytes_in_a_call_are_not_copied_into_its_pickle() -> None:
     assert type(one) is bytes
 
 
-def test_what_its_owner_may_change_is_kept_by_a_copy() -> None:
+def test_a_buffer_that_can_change_is_kept_as_a_copy() -> None:
     fixed, open_ = bytes(10), bytearray(10)
     views = packet.kept([memoryview(fixed), memoryview(open_)])
     open_[0] = 1

@@ -189,7 +189,7 @@ def test_one_that_is_at_work_is_never_released() -> None:
     assert (wish.agents, wish.release, wish.wake_at) == (1, [], math.inf)
 
 
-def test_a_worker_that_dies_and_is_started_again_does_not_change_what_is_wanted() -> None:
+def test_a_worker_that_is_started_again_does_not_change_the_demand() -> None:
     placement = with_agents("a", "b", slots=1)
     wanted = demand(placement)
     put(placement, "1", "2")
@@ -201,7 +201,7 @@ def test_a_worker_that_dies_and_is_started_again_does_not_change_what_is_wanted(
     assert wanted.decide(now=1.1).agents == 2
 
 
-def test_agents_that_have_not_joined_are_given_up_when_nobody_waits_for_long_enough() -> None:
+def test_agents_that_have_not_joined_are_given_up_after_a_time_without_waiting_children() -> None:
     placement = with_agents(slots=1)
     wanted = demand(placement)
     put(placement, *"123")

@@ -103,14 +103,14 @@ def test_a_program_in_a_folder_that_git_ignores_is_sent(folder: Path) -> None:
     assert names(folder) == {"main.py", "data/weights.npy"}
 
 
-def test_what_was_imported_is_sent_whatever_is_ignored(folder: Path, tmp_path: Path) -> None:
+def test_an_imported_file_is_sent_even_if_it_is_ignored(folder: Path, tmp_path: Path) -> None:
     imported = write(folder, build__fast_so="x", build__slow_so="x") / "build/fast.so"
     (folder / ".gitignore").write_text("build/\n")
     there = unpacked(packed(folder, files=(imported,)), tmp_path / "there")
     assert os.listdir(there / "es/build") == ["fast.so"]
 
 
-def test_what_tools_leave_is_not_sent_unless_somebody_says_so(folder: Path) -> None:
+def test_files_of_tools_are_sent_only_if_fiberignore_includes_them(folder: Path) -> None:
     write(folder, cache__x_pyc="x", node__x_js="x", venv__lib__x_py="x", venv__pyvenv_cfg="x")
     (folder / "cache").rename(folder / "__pycache__")
     (folder / "node").rename(folder / "node_modules")
@@ -325,7 +325,7 @@ def test_a_file_that_is_gone_when_it_is_read_is_left_out(folder: Path, tmp_path:
 # The bound
 
 
-def test_too_much_is_an_error_that_lists_the_largest_and_says_what_to_do(
+def test_a_program_that_is_too_large_is_an_error_with_its_largest_files_and_advice(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(program_files, "LIMIT", 3 << 20)
@@ -342,7 +342,7 @@ def test_too_much_is_an_error_that_lists_the_largest_and_says_what_to_do(
     assert names(folder) == {".fiberignore", "main.py"}
 
 
-def test_what_grows_beyond_the_bound_meanwhile_is_the_same_error(
+def test_a_file_that_grows_beyond_the_limit_during_packing_is_the_same_error(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(program_files, "LIMIT", 1 << 20)

@@ -104,7 +104,7 @@ def test_folders_on_the_path_that_are_offered_come_along_in_their_order(machine:
     assert layout.paths.before_installed == ("lib-2",)
 
 
-def test_of_other_folders_on_the_path_what_was_imported_comes_along(machine: Machine) -> None:
+def test_imported_modules_of_other_folders_on_the_path_are_sent(machine: Machine) -> None:
     machine.runs(machine.es / "main.py")
     write(machine.lib, big__data_npy="x", space__deep__tool_py="", single_py="", other_py="")
     machine.has_imported("shared", machine.lib / "shared/init.py", machine.lib / "shared")
@@ -132,7 +132,7 @@ def test_folders_within_one_another_are_sent_once(machine: Machine) -> None:
     assert layout.paths == (("es/pkg/sub", "es"), (), "es/pkg/sub", "es/pkg/sub/tool.py")
 
 
-def test_what_is_installed_is_the_images(machine: Machine) -> None:
+def test_installed_packages_are_not_sent(machine: Machine) -> None:
     machine.runs(machine.es / "main.py")
     fiber = Path(program_layout.__file__).parents[2]
     other = machine.lib / "python3/site-packages"
@@ -141,7 +141,7 @@ def test_what_is_installed_is_the_images(machine: Machine) -> None:
     assert layout.places == {str(machine.es): "es"}
 
 
-def test_what_is_installed_within_the_programs_folder_is_on_no_path(machine: Machine) -> None:
+def test_packages_installed_in_the_programs_folder_are_not_on_the_path(machine: Machine) -> None:
     machine.runs(machine.es / "main.py")
     inside = write(machine.es / ".venv/lib/site-packages", pkg_py="")
     layout = machine.layout(machine.es, STDLIB, inside)
@@ -162,7 +162,7 @@ def test_an_installed_command_is_like_a_session(machine: Machine) -> None:
     assert layout.paths.main is None
 
 
-def test_of_a_home_directory_only_what_was_imported_is_sent(machine: Machine) -> None:
+def test_only_imported_modules_of_a_home_directory_are_sent(machine: Machine) -> None:
     machine.runs(machine.home / "train.py")
     machine.has_imported("helper", machine.home / "helper.py")
     machine.has_imported("pkg", machine.es / "pkg/__init__.py", machine.es / "pkg")
@@ -172,7 +172,7 @@ def test_of_a_home_directory_only_what_was_imported_is_sent(machine: Machine) ->
     assert layout.paths == (("program",), (), "program", "program/train.py")
 
 
-def test_what_was_imported_from_a_namespace_keeps_its_name(machine: Machine) -> None:
+def test_a_module_of_a_namespace_package_keeps_its_path(machine: Machine) -> None:
     machine.runs(machine.home / "train.py")
     module = write(machine.home / "space", part__tool_py="") / "part/tool.py"
     space: Any = ModuleType("space")
@@ -184,7 +184,7 @@ def test_what_was_imported_from_a_namespace_keeps_its_name(machine: Machine) -> 
 
 
 @pytest.mark.parametrize("folder", ["/", "home", "above"])
-def test_a_session_in_a_folder_that_is_nobodys_sends_nothing_of_it(
+def test_a_session_in_a_home_or_system_folder_sends_no_files_of_it(
     machine: Machine, folder: str
 ) -> None:
     here = {"home": machine.home, "above": machine.home.parent}.get(folder, Path("/"))
@@ -193,7 +193,7 @@ def test_a_session_in_a_folder_that_is_nobodys_sends_nothing_of_it(
     assert layout.paths == ((), (), "program", None)
 
 
-def test_what_was_left_out_is_sent_as_far_as_it_was_imported(machine: Machine) -> None:
+def test_imported_modules_of_a_left_out_folder_are_sent(machine: Machine) -> None:
     machine.has_imported("tool", machine.es / "pkg/sub/tool.py")
     layout = machine.layout(machine.es, STDLIB, left_out=(machine.es,))
     assert layout.places == {str(machine.es / "pkg/sub/tool.py"): "program/tool.py"}

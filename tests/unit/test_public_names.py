@@ -63,7 +63,7 @@ def test_submodules_have_multiprocessings_names(name: str) -> None:
     assert {other for other in public_names(theirs) if not hasattr(ours, other)} == set()
 
 
-def test_what_libraries_import_beside_the_public_names_is_multiprocessings() -> None:
+def test_private_names_that_libraries_import_are_those_of_multiprocessing() -> None:
     from multiprocessing import connection, reduction, util
 
     assert fiber.util._exit_function is vars(util)["_exit_function"]

@@ -193,7 +193,7 @@ def test_open_files_are_refused_and_standard_streams_are_not(
     assert stream is sys.stdout
 
 
-def test_blame_names_what_refers_to_itself_too() -> None:
+def test_blame_names_the_argument_of_an_object_that_contains_itself() -> None:
     loop: list[Any] = [threading.Lock()]
     loop.insert(0, loop)
     error = reduction.blame({"it": loop}, TypeError("no"))
@@ -201,7 +201,7 @@ def test_blame_names_what_refers_to_itself_too() -> None:
     assert error.what == "it"
 
 
-def test_blame_leaves_no_descriptor_of_what_multiprocessing_made() -> None:
+def test_blame_leaves_no_descriptor_of_a_multiprocessing_queue_open() -> None:
     theirs = multiprocessing.Queue()
     before = open_files()
     error = reduction.blame({"it": [theirs]}, pickle.PicklingError("no"))

@@ -122,7 +122,7 @@ def test_a_start_follows_its_blobs_and_a_signal_its_start(large: Any) -> None:
     assert link.kinds()[5:] == ["Signal"]
 
 
-def test_a_child_whose_agent_is_lost_before_its_start_has_read_nothing(large: Any) -> None:
+def test_packets_of_a_child_whose_agent_is_lost_before_its_start_are_unread(large: Any) -> None:
     link, _, agent, _, observer = large
     agent.on_lost("silence")
     assert observer.wait_for_exit().unread == (5,)

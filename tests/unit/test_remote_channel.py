@@ -59,7 +59,7 @@ def word(message: Message | None) -> Any:
     return pickle.loads(message.payload)
 
 
-def test_what_a_borrowed_worker_says_goes_to_its_borrower(far: Far) -> None:
+def test_a_leased_worker_answers_its_caller(far: Far) -> None:
     channel = far.child.lend()
     assert channel is not None
     channel.send(7, b"call")
@@ -99,7 +99,7 @@ def test_a_waiting_caller_is_woken(far: Far, event: Callable[[Far], None]) -> No
     assert len(heard) == 1
 
 
-def test_what_nobody_received_is_heard_after_all(far: Far) -> None:
+def test_an_answer_that_the_caller_did_not_receive_goes_to_the_observer(far: Far) -> None:
     channel = far.child.lend()
     assert channel is not None
     channel.send(7, b"call")
@@ -123,7 +123,7 @@ def test_an_answer_comes_before_the_end(far: Far) -> None:
         channel.send(8, b"call")
 
 
-def test_what_met_the_end_on_its_way_is_named_unread(far: Far) -> None:
+def test_a_call_that_the_worker_did_not_get_is_reported_as_unread(far: Far) -> None:
     channel = far.child.lend()
     assert channel is not None
     channel.send(7, b"call")
@@ -146,7 +146,7 @@ def test_of_more_than_is_remembered_all_that_is_remembered_is_named_unread(
     assert far.observer.report.unread == (2, 3, 4, 5)
 
 
-def test_what_never_left_is_told_to_its_sender(far: Far) -> None:
+def test_a_call_that_was_not_sent_raises_a_broken_pipe_error(far: Far) -> None:
     channel = far.child.lend()
     assert channel is not None
     channel.send(7, b"call")  # waits for the loop, which gets the end first

@@ -133,7 +133,7 @@ def test_it_goes_on_to_other_processes(here: Any, far: Far, hosts: Hosts) -> Non
         assert not here.acquire(False)
 
 
-def test_nothing_is_kept_for_nobody(far: Far, hosts: Hosts) -> None:
+def test_the_hub_drops_an_object_without_users(far: Far, hosts: Hosts) -> None:
     lock = fiber.Lock()
     there = far(lock)
     assert objects_kept(hosts["a"]) == 1

@@ -129,7 +129,7 @@ def test_at_home_it_is_the_memory_itself(far: Far, hosts: Hosts) -> None:
 # Kept objects
 
 
-def test_nothing_is_left_once_nobody_uses_it(star: Hosts) -> None:
+def test_replicas_are_dropped_on_all_hosts_after_the_last_use(star: Hosts) -> None:
     with star.at("one"):
         array = fiber.RawArray("i", [5])
     there = Pipe(star, "one", "two")
@@ -144,7 +144,9 @@ def test_nothing_is_left_once_nobody_uses_it(star: Hosts) -> None:
     assert list(there.send(array)) == [6]
 
 
-def test_a_home_that_is_gone_leaves_what_was_known(hosts: Hosts, wires: tuple[Wire, Wire]) -> None:
+def test_a_replica_stays_usable_after_its_home_is_lost(
+    hosts: Hosts, wires: tuple[Wire, Wire]
+) -> None:
     there = Pipe(hosts, "a", "b")
     with hosts.at("a"):
         array, late = fiber.RawArray("i", [7]), pickle.dumps(fiber.RawArray("i", 1))

@@ -156,7 +156,7 @@ def test_an_interrupted_wait_for_an_iterator_loses_no_result(
     assert list(found) == [3]
 
 
-def test_whoever_is_interrupted_at_any_step_asks_for_more_the_next_time(
+def test_a_read_that_was_interrupted_at_any_step_asks_for_more_the_next_time(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(results, "HELD", 1)
@@ -189,7 +189,7 @@ def test_whoever_is_interrupted_at_any_step_asks_for_more_the_next_time(
 
 
 @pytest.mark.parametrize("ordered", [True, False])
-def test_what_is_unread_is_held_back_and_costs_the_same_however_much_it_is(
+def test_unread_results_are_held_back_at_a_cost_independent_of_their_number(
     ordered: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(results, "HELD", 1000)
@@ -249,7 +249,7 @@ def test_a_map_whose_getting_is_interrupted_at_any_step_raises_its_error_the_nex
     assert steps > 10, "it was hardly interrupted"
 
 
-def test_what_unpickles_to_an_error_is_raised_and_the_next_is_there() -> None:
+def test_an_iterator_raises_a_failed_task_and_goes_on_with_the_next() -> None:
     found = iterator()
     found._buffer.add_results(0, [TaskFailure(KeyError("one")), 2], True)
     with pytest.raises(KeyError):

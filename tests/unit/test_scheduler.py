@@ -140,7 +140,7 @@ def test_idle_workers_ask_for_unread_tasks_of_busy_ones() -> None:
     assert scheduler.decide(RECALL_AFTER).recall == [], "it was asked"
 
 
-def test_a_worker_that_becomes_ready_after_it_was_told_to_go_gets_nothing() -> None:
+def test_a_worker_that_becomes_ready_after_its_dismissal_gets_no_tasks() -> None:
     scheduler = Scheduler(1, 1)
     member = Member()
     scheduler.starting(member)
@@ -216,7 +216,7 @@ def test_a_task_for_each_worker_goes_to_those_that_are_starting_too() -> None:
     assert job.finished
 
 
-def test_what_a_lost_worker_alone_was_to_run_is_for_a_newcomer() -> None:
+def test_the_pinned_task_of_a_lost_worker_goes_to_a_new_worker() -> None:
     scheduler, members = pool(1, 2)
     job = scheduler.ledger.open("owner")
     scheduler.pin_everywhere(job, "item")
@@ -228,7 +228,7 @@ def test_what_a_lost_worker_alone_was_to_run_is_for_a_newcomer() -> None:
     assert len(scheduler.decide(0.0).assign) == 1
 
 
-def test_who_waits_for_a_newcomer_hears_that_none_starts_while_others_work() -> None:
+def test_a_job_that_needs_a_new_worker_fails_if_none_starts_although_others_work() -> None:
     scheduler, members = pool(2)
     pinned = scheduler.ledger.open("owner")
     scheduler.pin_everywhere(pinned, "item")
@@ -314,7 +314,7 @@ def test_a_worker_that_is_returned_while_it_runs_a_call() -> None:
     assert scheduler.lease(worker)
 
 
-def test_what_a_returned_worker_runs_for_nobody_holds_it_up_and_no_more() -> None:
+def test_a_returned_worker_that_runs_an_abandoned_call_is_dismissed_after_it() -> None:
     scheduler, members = pool(1)
     worker = members[0].ready
     assert scheduler.lease(worker)
@@ -425,7 +425,7 @@ def test_after_a_failure_it_asks_to_be_asked_again_and_tries_one() -> None:
     assert scheduler.decide(FIRST_PAUSE).start == 2, "they can start again"
 
 
-def test_when_none_starts_all_jobs_hear_of_it_and_who_is_left_is_ended() -> None:
+def test_if_no_worker_starts_all_jobs_fail_and_starting_workers_are_ended() -> None:
     scheduler = Scheduler(2, 2)
     job = job_of(scheduler, 5)
     slow = Member()

@@ -72,7 +72,7 @@ def test_no_nonce_comes_twice_under_a_key(monkeypatch: pytest.MonkeyPatch) -> No
     assert len({key for key, _ in used}) == 16
 
 
-def test_the_limits_are_far_below_what_gcm_bears() -> None:
+def test_the_limits_of_a_key_are_below_those_of_gcm() -> None:
     assert nng.MESSAGES_PER_KEY < 2**32
     assert nng.BYTES_PER_KEY <= 2**36
 
@@ -91,7 +91,7 @@ def test_a_message_too_short_to_be_sealed(size: int) -> None:
         Opener(SECRET).open(bytes(size))
 
 
-def test_neither_a_repetition_nor_what_comes_too_early_opens() -> None:
+def test_a_repeated_or_early_message_does_not_open() -> None:
     sealer = Sealer(SECRET)
     first, _, third = (sealed(sealer, b"same") for _ in range(3))
     opener = Opener(SECRET)
@@ -127,7 +127,7 @@ def test_a_thousand_connections_take_the_memory_of_one() -> None:
     assert {id(opened(size).obj) for size in range(1000)} == {id(largest.obj)}
 
 
-def test_what_one_thread_has_opened_is_not_overwritten_by_another() -> None:
+def test_threads_open_messages_into_buffers_of_their_own() -> None:
     mine, others = opened(1000), []
     thread = threading.Thread(target=lambda: others.append(opened(1000)))
     thread.start()

@@ -296,7 +296,7 @@ def test_an_acknowledgement_waits_only_so_long() -> None:
     assert one.idle
 
 
-def test_a_loss_is_noticed_by_what_follows() -> None:
+def test_the_datagram_after_a_lost_one_raises_gap() -> None:
     one, other = pair()
     one.send(b"lost")
     one.outgoing(0)
@@ -418,7 +418,7 @@ def numbered(frames: int) -> bytes:
         (b"\x02" + bytes(15) + b"\x09" + bytes(7), "acknowledges datagram 9, but only 0 were sent"),
     ],
 )
-def test_what_no_stream_sends_is_refused(datagram: bytes, complaint: str) -> None:
+def test_a_datagram_that_no_stream_sends_is_refused(datagram: bytes, complaint: str) -> None:
     stream, _ = pair()
     with pytest.raises(ProtocolError, match=complaint):
         stream.received(datagram, 0)

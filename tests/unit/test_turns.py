@@ -59,7 +59,7 @@ def test_the_frames_of_a_lane_keep_their_order(
     assert list(arriving(sender, receiver)) == [b"of another", *frames]
 
 
-def test_nothing_passes_what_has_no_lane(
+def test_no_message_passes_one_without_a_lane(
     ends: tuple[LinkProtocol, LinkProtocol],
 ) -> None:
     sender, receiver = ends
@@ -119,7 +119,7 @@ def test_it_says_when_a_frame_has_left(ends: tuple[LinkProtocol, LinkProtocol]) 
     assert sender.statistics().queued_bytes == sender.statistics().queued_frames == 0
 
 
-def test_what_is_held_is_a_window_and_what_has_arrived() -> None:
+def test_a_link_holds_at_most_a_window_and_the_partial_message() -> None:
     sender, receiver = (LinkProtocol(0, budget=BUDGET, window_bytes=4 * BUDGET) for _ in range(2))
     sender.connected(0)
     receiver.connected(0)
@@ -139,7 +139,7 @@ def test_what_is_held_is_a_window_and_what_has_arrived() -> None:
     assert receiver.statistics().partial_bytes == 0
 
 
-def test_a_stream_that_ends_forgets_what_has_arrived_of_a_frame(
+def test_a_stream_that_ends_drops_partial_frames(
     ends: tuple[LinkProtocol, LinkProtocol],
 ) -> None:
     sender, receiver = ends

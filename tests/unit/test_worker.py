@@ -252,7 +252,7 @@ def test_the_oldest_functions_are_forgotten(rig: Rig) -> None:
     assert rig.channel.said[-1] == (work.UNKNOWN, seq)
 
 
-def test_what_does_not_unpickle_is_reported(rig: Rig) -> None:
+def test_a_batch_that_does_not_unpickle_is_reported(rig: Rig) -> None:
     rig._handle(work.pack_batch(work.Head(work.MAP, 0, 1, 1, 4, 0), b"junk", b""), [])
     kind, seq, error = rig.channel.said[-1]
     assert (kind, seq) == (work.BROKEN, 1)
@@ -299,7 +299,7 @@ def note(_: object) -> None:
 
 
 @MODES
-def test_what_was_done_before_sys_exit_is_sent(
+def test_results_before_a_sys_exit_are_sent(
     rig: Rig, mode: dict[str, int], capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit):
@@ -465,7 +465,7 @@ def block_at_two(x: int) -> int:
     return x
 
 
-def test_a_batch_that_takes_too_long_gives_back_what_is_left(impatient: Rig) -> None:
+def test_a_batch_that_takes_too_long_gives_back_its_remaining_tasks(impatient: Rig) -> None:
     impatient.give(slow, list(range(1000)), stride=5)
     kept = [words[2] for words in impatient.channel.said if words[2] is not None]
     assert kept
@@ -517,7 +517,7 @@ def test_large_calls_functions_items_and_results(rig: Rig, size: int) -> None:
         assert rig.channel.results(seq) == [(text, text), (text, b""), (text, "y")]
 
 
-def test_what_is_large_in_an_answer_lies_beside_it(rig: Rig) -> None:
+def test_large_values_of_an_answer_travel_beside_its_pickle(rig: Rig) -> None:
     for value in ("x" * LARGE, b"x" * LARGE, ("row", b"x" * LARGE), ["x" * LARGE]):
         rig.channel.said.clear()
         rig.channel.buffers.clear()

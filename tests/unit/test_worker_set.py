@@ -135,7 +135,7 @@ def test_however_long_it_takes_there_are_some_tries(workers: PoolWorkerSet) -> N
     assert workers.error is not None
 
 
-def test_one_that_was_killed_after_some_that_raised_may_have_done_nothing_wrong(
+def test_a_killed_worker_does_not_end_a_pool_whose_workers_raised_before(
     workers: PoolWorkerSet,
 ) -> None:
     fail_until(workers, RAISED_PATIENCE / 2, RAISED)
@@ -170,7 +170,7 @@ def test_patience_begins_when_the_last_at_work_is_lost(
     assert workers.error is not None
 
 
-def test_a_lost_host_says_nothing_of_its_workers(workers: PoolWorkerSet) -> None:
+def test_workers_of_lost_hosts_do_not_count_as_failures(workers: PoolWorkerSet) -> None:
     for at in range(100):
         workers.gone(start(workers), float(at), None)
     assert (workers.failures, workers.error, workers.next_try()) == (0, None, None)
@@ -218,7 +218,7 @@ def test_after_a_pause_one_is_tried(workers: PoolWorkerSet) -> None:
     assert workers.startable(3, 10.1) == 3
 
 
-def test_what_fails_in_a_pause_is_of_the_same_wave(workers: PoolWorkerSet) -> None:
+def test_failures_during_a_pause_belong_to_the_same_wave(workers: PoolWorkerSet) -> None:
     late = [start(workers) for _ in range(3)]
     fail(workers, 10.0)
     for member in late:
@@ -265,7 +265,7 @@ def test_a_worker_that_dies_at_work_is_replaced_at_once(workers: PoolWorkerSet) 
 # Messages
 
 
-def test_failures_that_last_are_told_once_while_one_waits(workers: PoolWorkerSet) -> None:
+def test_failures_that_last_are_reported_once(workers: PoolWorkerSet) -> None:
     fail(workers, 0.0, KILLED)
     assert workers.news(KILLED, 0.0) == ""
     fail(workers, SAID_AFTER, KILLED)
