@@ -95,6 +95,13 @@ async def _document(response: RESTResponse, what: str) -> Body:
     return document_of(response.status, response.headers, await response.read(), what)
 
 
+async def _success(response: RESTResponse, what: str) -> None:
+    """Raise the error of a response that is no success; do not decode the others."""
+    data = await response.read()
+    if not 200 <= response.status < 300:
+        document_of(response.status, response.headers, data, what)
+
+
 class Cluster:
     """Client of one API server.
 
@@ -293,7 +300,7 @@ class Cluster:
             "preconditions": {key: value for key, value in preconditions.items() if value},
             "propagationPolicy": "Background",
         }
-        await self._call("delete", resource, namespace, name, body=options)
+        await self._call("delete", resource, namespace, name, body=options, read=_success)
 
     async def _call(
         self,

@@ -52,7 +52,7 @@ from fiber_operator.responses import (
     TooMany,
     Unavailable,
 )
-from fiber_operator.workqueue import GAP, Key, Result
+from fiber_operator.workqueue import Key, Result
 
 log = logging.getLogger(__name__)
 
@@ -246,16 +246,18 @@ class Applier:
             work.creation.stop()
         deleted, as_planned = await self._delete(work)
         if deleted < len(work.plan.delete):
-            # The pods or the pool have changed since: the watch shows it soon.
-            return Result(requeue_after=0.0 if as_planned else GAP)
+            return Result(requeue_after=0.0) if as_planned else Result(failed=True)
         if work.pool is not None and work.state.address is not None and work.plan.create:
             body = podspec.pod_maker(work.pool, work.state.address, self._requests)
             order = Order(work.plan.template_hash, body, work.plan.batch_limit)
             work.creation.aim(work.plan.create, order)
-        return Result() if as_planned else Result(requeue_after=GAP)
+        return Result(failed=not as_planned)
 
     async def _delete(self, work: Work) -> tuple[int, bool]:
         """Delete pods; return how many were handled, and whether all were as in the plan.
+
+        Where they were not, the watch shows soon what has changed.  A watch that is behind makes
+        the API server refuse the same deletions again, so the next attempts come ever later.
 
         It stops after some time, so that the status is not out of date for long.
         """
@@ -565,4 +567,6 @@ def _together(result: Result, made: Result, waited: float) -> Result:
     if after is None and result.requeue_after is not None:
         after = max(0.0, result.requeue_after - waited)
     rest = max(made.rest, result.rest - waited)
-    return dataclasses.replace(result, requeue_after=after, rest=rest, failed=made.failed)
+    return dataclasses.replace(
+        result, requeue_after=after, rest=rest, failed=result.failed or made.failed
+    )

@@ -11,7 +11,8 @@ informer.  A pod that it created is in the cache from then on.  A pod that it de
 terminating, even if the watch shows it otherwise.  Kubernetes' controllers call this expectations.
 
 A watch that breaks off is continued from its last version.  If the API server no longer has that
-version (410 Gone), the pods are listed again, and the list replaces the cache.
+version (410 Gone), or after two failures in a row, the pods are listed again, and the list replaces
+the cache.
 """
 
 from __future__ import annotations
@@ -36,6 +37,8 @@ SYNC_TIMEOUT = 30.0
 """Seconds for which a reconcile waits for the first list."""
 CONFIRMED_WITHIN = 30.0
 """Seconds within which the watch shows a created pod.  After that the pods are listed again."""
+SHORT = 1.0
+"""Seconds: a watch that ends earlier, and without an event, has failed."""
 REMEMBERED = 1000
 """Number of deleted pods whose uids are kept: the answer to a creation may come after the end."""
 
@@ -124,16 +127,21 @@ class _Reflector:
         The oldest is the first."""
         self._ending: set[str] = set()
         """The uids of pods that this operator has deleted and that the watch has not ended."""
-        self._gone: OrderedDict[str, None] = OrderedDict()
+        self._gone: OrderedDict[str, float] = OrderedDict()
+        """Pods that have left the cache: uid -> time of the event loop."""
+        self._stale = True
+        """True if the pods must be listed.  Only a completed list changes it to False."""
         self._version = ""
-        """Version that the watch goes on from.  Empty: the pods must be listed."""
+        """Version that the watch goes on from."""
         self._refreshes = 0
         self._settled = asyncio.Event()
         """Set once the pods are known, or ``_failure`` says why they are not."""
         self._failure: ApiError | None = None
         self._failures = 0
-        """Attempts that failed since the last one that succeeded."""
+        """Attempts that failed since a watch brought an event or lasted for a while."""
         self._watching: asyncio.Timeout | None = None
+        self._trial: asyncio.TimerHandle | None = None
+        """Timer after which a watch that follows a failure counts as working."""
 
     async def pods(self, namespace: str, uid: str) -> list[PodView]:
         try:
@@ -146,7 +154,7 @@ class _Reflector:
         return list(self._pools.get((namespace, uid), {}).values())
 
     def refresh(self) -> None:
-        self._version = ""
+        self._stale = True
         self._refreshes += 1
         self._settled.clear()
         if self._watching is not None:
@@ -159,7 +167,7 @@ class _Reflector:
         uid = text(mapping(document, "metadata").get("uid"))
         if uid not in self._pods and uid not in self._gone:
             self._expected[uid] = _now()
-            self._keep(document)
+            self._keep(uid, document)
 
     def deleted(self, uid: str, *, gone: bool) -> None:
         if gone:
@@ -175,22 +183,32 @@ class _Reflector:
             try:
                 await self._follow()
             except ApiError as error:
-                if error.status == 410:
-                    self._version = ""
-                    continue
-                # A watch that breaks off once is begun again, and the pods are known meanwhile.
-                if self._failures or isinstance(error, Refused):
-                    self._failure, self._version = error, ""
-                    self._settled.set()
-                    self._answered(self._request_name("watch"), error)
-                pause = PAUSES[min(self._failures, len(PAUSES) - 1)]
-                self._failures += 1
-                await asyncio.sleep(pause)
+                await self._recover(error)
+
+    async def _recover(self, error: ApiError) -> None:
+        """Report a failure if it is the second in a row, and pause before the next attempt."""
+        again, expired = self._failures > 0, error.status == 410
+        self._failures += 1
+        # A watch that breaks off once is begun again, and the pods are known meanwhile.
+        if again or isinstance(error, Refused):
+            self._failure = error
+            self._settled.set()
+            self._answered(self._request_name("watch"), error)
+        self._stale = self._stale or self._failure is not None or expired
+        if again or not expired:
+            await asyncio.sleep(PAUSES[min(self._failures, len(PAUSES)) - 1])
 
     async def _follow(self) -> None:
-        """List the pods if the cache has no version, and watch until the watch ends."""
-        while not self._version:
+        """List if need be, and watch until the watch ends."""
+        while self._stale:
             await self._list()
+        began, version = _now(), self._version
+        refreshed = await self._watch()
+        if not refreshed and self._version == version and _now() - began < SHORT:
+            raise Unavailable("the watch ended at once", what=self._request_name("watch"))
+
+    async def _watch(self) -> bool:
+        """Watch until the watch ends; return True if a refresh ended it."""
         deadline = asyncio.timeout(None)
         try:
             async with deadline as self._watching:
@@ -205,12 +223,22 @@ class _Reflector:
         except TimeoutError:
             if not deadline.expired():
                 raise
+            return True
         finally:
             self._watching = None
+            if self._trial is not None:
+                self._trial.cancel()
+        return False
 
     def _opened(self) -> None:
+        if self._failures:
+            # The last watch failed.  This one works if it lasts, or brings an event.
+            self._trial = asyncio.get_running_loop().call_later(SHORT, self._works)
+        else:
+            self._works()
+
+    def _works(self) -> None:
         self._failure, self._failures = None, 0
-        self._settled.set()
         self._answered(self._request_name("watch"), None)
 
     def _request_name(self, verb: str) -> str:
@@ -221,7 +249,11 @@ class _Reflector:
         listed: set[str] = set()
 
         def keep(document: Body) -> None:
-            listed.add(self._show(document))
+            uid = self._uid(document)
+            listed.add(uid)
+            # A pod that has left the cache since then may still be in the list.
+            if self._gone.get(uid, -1.0) < began:
+                self._show(uid, document)
 
         version = await self._cluster.list_all(PODS, self._namespace, keep, selector=_SELECTOR)
         for uid in [uid for uid in self._pods if uid not in listed]:
@@ -229,36 +261,41 @@ class _Reflector:
             if self._expected.get(uid, -1.0) < began:
                 self._drop(uid)
         if refreshes == self._refreshes:
-            self._version = version
-            if self._failure is None:
-                self._settled.set()
+            self._stale, self._version, self._failure = False, version, None
+            self._settled.set()
 
     def _take(self, kind: str, document: Body) -> None:
         """Apply one event of the watch to the cache."""
+        if self._stale:
+            return  # the list that comes next is newer
         metadata = mapping(document, "metadata")
-        self._version = text(metadata.get("resourceVersion")) or self._version
         if kind == "DELETED":
-            self._drop(text(metadata.get("uid")))
+            self._drop(self._uid(document))
         elif kind in ("ADDED", "MODIFIED"):
-            self._show(document)
+            self._show(self._uid(document), document)
+        self._version = text(metadata.get("resourceVersion")) or self._version
+        if self._failures:
+            self._works()
         oldest = next(iter(self._expected.values()), None)
         if oldest is not None and _now() - oldest > CONFIRMED_WITHIN:
             self.refresh()
 
-    def _show(self, document: Body) -> str:
-        """Put a pod of a list or watch into the cache.  Return its uid."""
+    def _uid(self, document: Body) -> str:
         uid = text(mapping(document, "metadata").get("uid"))
         if not uid:
             raise Unavailable("a pod has no uid", what=self._request_name("watch"))
-        self._expected.pop(uid, None)
-        self._keep(document)
         return uid
+
+    def _show(self, uid: str, document: Body) -> None:
+        """Put a pod of a list or watch into the cache."""
+        self._expected.pop(uid, None)
+        self._keep(uid, document)
 
     # The cache
 
-    def _keep(self, document: Body) -> None:
+    def _keep(self, uid: str, document: Body) -> None:
         metadata = mapping(document, "metadata")
-        uid, version = text(metadata.get("uid")), text(metadata.get("resourceVersion"))
+        version = text(metadata.get("resourceVersion"))
         before = self._pods.get(uid)
         if before is not None and version and before.view.resource_version == version:
             return  # the answer to a creation, and the event of the same creation
@@ -269,8 +306,10 @@ class _Reflector:
         key = Key(text(metadata.get("namespace")), text(labels.get(names.LABEL_POOL)))
         pool = key.namespace, text(labels.get(names.LABEL_POOL_UID))
         known = _Known(key, pool, view)
-        if before is not None and before.pool != known.pool:
+        if before is not None and (before.key, before.pool) != (key, pool):
             self._drop(uid)
+            before = None
+        self._gone.pop(uid, None)
         self._put(uid, known)
         if before is None or not _same(before.view, view):
             self._changed(key)
@@ -282,7 +321,7 @@ class _Reflector:
     def _drop(self, uid: str) -> None:
         self._expected.pop(uid, None)
         self._ending.discard(uid)
-        self._gone[uid] = None
+        self._gone[uid] = _now()
         if len(self._gone) > REMEMBERED:
             self._gone.popitem(last=False)
         known = self._pods.pop(uid, None)

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import asyncio
 import codecs
+import contextlib
 import json
 import re
 from collections.abc import AsyncIterator, Callable, Mapping
@@ -29,6 +30,7 @@ Body = dict[str, Any]
 
 LONGEST_RETRY_AFTER = 60.0
 _MESSAGE_LIMIT = 2000
+_STRING = re.compile(rb'"[^"]*"')
 
 
 class ApiError(Exception):
@@ -114,19 +116,32 @@ def object_of(answer: Body, name: str, what: str) -> Body:
 
 def document_of(status: int, headers: Mapping[str, str], data: bytes, what: str) -> Body:
     """Return the document in a response; raise ``ApiError`` if the response is no success."""
-    # Each value but the first of its list or object has a comma before it.
-    if data.count(b",") + data.count(b"[") + data.count(b"{") > MOST_VALUES:
+    good = 200 <= status < 300
+    body = None
+    if not _has_more_values(data, MOST_VALUES):
+        with contextlib.suppress(ValueError, RecursionError):
+            body = json.loads(data)
+    elif good:
         raise Oversized(f"it has more than {MOST_VALUES} values", what=what, status=status)
-    try:
-        body = json.loads(data)
-    except (ValueError, RecursionError):
-        body = None
-    if 200 <= status < 300:
+    if good:
         if isinstance(body, dict):
             return body
         # The data are not shown: they may be part of a Secret.
         raise Unavailable(f"the answer is no JSON object ({len(data)} bytes)", what=what)
     raise _error(status, headers, body if isinstance(body, dict) else {}, data, what)
+
+
+def _has_more_values(data: bytes, most: int) -> bool:
+    if _count_values(data) <= most:
+        return False
+    # Text in strings does not count: a list of comma-separated names is one value.
+    unescaped = data.replace(rb"\\", b"").replace(rb"\"", b"")
+    return _count_values(_STRING.sub(b"", unescaped)) > most
+
+
+def _count_values(data: bytes) -> int:
+    # Each value but the first of its list or object has a comma before it.
+    return data.count(b",") + data.count(b"[") + data.count(b"{")
 
 
 def event_of(line: bytes, what: str) -> tuple[str, Body]:
@@ -135,7 +150,8 @@ def event_of(line: bytes, what: str) -> tuple[str, Body]:
         event = json.loads(line)
     except (ValueError, RecursionError):
         event = None
-    kind, body = (event.get("type"), event.get("object")) if isinstance(event, dict) else ("", {})
+    event = event if isinstance(event, dict) else {}
+    kind, body = event.get("type"), event.get("object")
     if not isinstance(kind, str) or not isinstance(body, dict):
         raise Unavailable("the answer is no event of a watch", what=what)
     if kind == "ERROR":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 from collections.abc import AsyncIterator, Callable, Coroutine
 from pathlib import Path
 from typing import Any
@@ -151,6 +152,27 @@ def test_each_status_is_one_error(status: int, error: type[responses.ApiError]) 
         assert type(caught.value) is error
         assert str(caught.value) == "create pods in here: words of the server"
         assert (caught.value.status, caught.value.reason) == (status, "Because")
+
+    with_api(test)
+
+
+def test_an_object_of_many_values_is_deleted_and_not_decoded() -> None:
+    async def test(api: KubernetesApi, door: Cluster) -> None:
+        text = json.dumps({"spec": [{}] * (responses.MOST_VALUES + 1)})
+        api.faults.append(Fault(text=text, times=2))
+        await door.delete(PODS, "here", "a", uid="any")
+        with pytest.raises(responses.Oversized):
+            await door.read(PODS, "here", "a")
+
+    with_api(test)
+
+
+def test_commas_in_a_message_do_not_change_the_error() -> None:
+    async def test(api: KubernetesApi, door: Cluster) -> None:
+        message = "," * (responses.MOST_VALUES + 1)
+        api.faults.append(Fault(status=422, reason="Invalid", message=message))
+        with pytest.raises(responses.Invalid):
+            await door.create(PODS, "here", pod("a"))
 
     with_api(test)
 

@@ -471,6 +471,34 @@ async def test_a_spec_of_too_many_values_is_not_read_and_the_pool_says_so(world:
 
 
 @played()
+async def test_a_long_text_of_comma_separated_values_is_one_value(world: World) -> None:
+    world.make_pool(replicas=1)
+    await world.ready(1)
+    (container,) = TEMPLATE["spec"]["containers"]
+    container = {**container, "args": ['a,b\\"[{' * responses.MOST_VALUES]}
+    world.edit(template={"spec": {"containers": [container]}}, replicas=3)
+    await world.ready(3)
+    assert world.reasons() == []
+
+
+@played()
+async def test_deletions_that_are_refused_are_tried_again_ever_later(world: World) -> None:
+    """The watch is behind, so the operator knows older versions of the pods."""
+    world.kubelet.auto = False
+    world.make_pool(replicas=2, master=MASTER)
+    await world.until(lambda: len(world.names()) == 2)
+    await world.settled(10)
+    world.api.watch_delay = 200
+    for name in world.names():
+        world.store.merge("pods", NAMESPACE, name, {"metadata": {"annotations": {"a": "b"}}})
+    world.edit(replicas=0)
+    assert await world.until(lambda: world.api.count("delete", "pods") > 0) < 65
+    await asyncio.sleep(60)
+    assert world.api.count("delete", "pods") <= 2 * 8
+    await world.until(lambda: not world.names())
+
+
+@played()
 async def test_a_deleted_pool_leaves_no_object(world: World) -> None:
     world.make_pool(replicas=3, master={**MASTER, "leaseName": "es"})
     await world.ready(3)

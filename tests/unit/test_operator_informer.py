@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
 from typing import Any
 
@@ -35,12 +36,15 @@ class Site:
         self.changed: list[Key] = []
         self.answers: dict[str, str] = {}
         """Errors by request: why it failed the last time, if it did."""
+        self.answered_well = 0
+        """Number of reports that a request works."""
         self.informer = PodInformer(
             cluster, namespaces=namespaces, changed=self.changed.append, answered=self._answered
         )
 
     def _answered(self, what: str, error: ApiError | None) -> None:
         self.answers[what] = str(error or "")
+        self.answered_well += error is None
 
     def body(self, name: str, namespace: str = NAMESPACE, pool: str = UID) -> Body:
         labels = {names.LABEL_POOL: "es", names.LABEL_POOL_UID: pool}
@@ -288,6 +292,51 @@ async def test_a_refresh_in_the_middle_of_a_list_lists_again(site: Site) -> None
     assert await site.names() == ["of another operator"]
 
 
+@played()
+async def test_an_event_just_after_a_refresh_does_not_undo_it(site: Site) -> None:
+    """The event that causes the refresh and the next event may come in one piece of data."""
+    await site.names()
+    await asyncio.sleep(1)
+    made = site.make("a")
+
+    def changed(key: Key) -> None:
+        site.informer.refresh()
+
+    site.informer._reflectors[None]._changed = changed
+    site.make("b")
+    await asyncio.sleep(1)
+    assert site.api.count("list", "pods") >= 2
+    assert await site.names() == ["a", "b"], made
+
+
+@played()
+async def test_a_list_that_began_earlier_does_not_bring_back_a_pod_that_is_gone(site: Site) -> None:
+    uid = site.make("a")["metadata"]["uid"]
+    await site.names()
+
+    def remove(call: Call) -> None:
+        if call.verb == "list":
+            site.api.after = lambda call: None
+            site.store.remove("pods", NAMESPACE, "a")  # the list is made already
+            site.informer.deleted(NAMESPACE, uid, gone=True)
+
+    site.api.after = remove
+    site.api.watch_delay = 60
+    site.informer.refresh()
+    assert await site.names() == []
+
+
+@played()
+async def test_a_pod_that_changes_its_pool_is_announced_to_both(site: Site) -> None:
+    site.make("a")
+    await site.until_there("a")
+    site.changed.clear()
+    labels = {names.LABEL_POOL: "other", names.LABEL_POOL_UID: "uid-of-other"}
+    site.store.merge("pods", NAMESPACE, "a", {"metadata": {"labels": labels}})
+    await site.until_there()
+    assert site.changed == [ES, Key(NAMESPACE, "other")]
+
+
 # -- Trouble
 
 
@@ -373,6 +422,35 @@ async def _is(held: bool) -> bool:
     return held
 
 
+@pytest.mark.parametrize(
+    "fault",
+    [
+        Fault("watch", status=410, reason="Expired"),
+        Fault("watch", text=""),
+        Fault("watch", text="{nonsense\n"),
+        Fault("watch", text='{"type": "ADDED", "object": {}}\n'),
+        Fault("watch", text='{"type": "ERROR", "object": {"code": 500}}\n'),
+        Fault("watch", text='{"type": "ERROR", "object": {"code": 410}}\n'),
+    ],
+    ids=lambda fault: fault.text if fault.text is not None else str(fault.status),
+)
+def test_a_watch_that_fails_each_time_is_reported_and_paused(fault: Fault) -> None:
+    @played()
+    async def test(site: Site) -> None:
+        site.api.faults.append(dataclasses.replace(fault, times=10**6))
+        await site.until(lambda: _is(bool(site.answers.get("watch pods"))))
+        site.answered_well = 0
+        before = site.api.count("watch", "pods")
+        await asyncio.sleep(600)
+        assert site.api.count("watch", "pods") - before <= 600 / informer.PAUSES[-1] + 5
+        assert site.answers["watch pods"] != ""
+        assert site.answered_well == 0, "it was reported to work"
+        with pytest.raises(Unavailable):
+            await site.names()
+
+    test()
+
+
 @played()
 async def test_one_failure_of_a_watch_does_not_hide_the_pods(site: Site) -> None:
     site.make("a")
@@ -400,7 +478,7 @@ def test_without_the_right_the_pods_are_not_known(verb: str) -> None:
         assert site.api.count(verb, "pods") < 5
         denied.times = 0
         await site.until_there()
-        assert site.answers["watch pods"] == ""
+        await site.until(lambda: _is(site.answers["watch pods"] == ""))
 
     test()
 

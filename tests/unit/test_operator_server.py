@@ -293,7 +293,7 @@ def test_a_pool_that_is_nested_deeply_hides_no_other(tmp_path: Path) -> None:
             process = await begin(world, tmp_path)
             try:
                 world.make_pool(replicas=3)
-                await world.until(lambda: "InvalidTemplate" in world.reasons("deep"), within=10)
+                await world.until(lambda: "InvalidTemplate" in world.reasons("deep"))
                 await world.until_settled(3)
             finally:
                 process.terminate()
