@@ -7,11 +7,9 @@ from typing import Any
 
 import pytest
 
-from faults.program import LOOPBACK, Program, wait_for
-from faults.runtime import running
+from faults.program import LOOPBACK, Program
+from faults.runtime import BACKENDS, running, running_on
 from faults.wire import Wire, wired
-
-BACKENDS = ("local", "loopback")
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -49,13 +47,7 @@ def launch_on(
 @pytest.fixture(scope="module", params=BACKENDS)
 def backend(request: pytest.FixtureRequest) -> Iterator[str]:
     """The runtime of this very process, on each backend in turn."""
-    with running(backend=request.param, agents=2) as runtime:
-        if request.param == "loopback":
-            # The thread that writes the agents' output lives as long as the runtime.
-            loopback: Any = runtime.backend
-            loopback._output.write("test", "begins")
-            wait_for(lambda: len(loopback.agents.agents) == len(loopback._slots))
-        yield request.param
+    yield from running_on(request.param)
 
 
 @pytest.fixture(scope="module")

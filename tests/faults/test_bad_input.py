@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import socket
 from collections.abc import Callable
 from typing import Any, cast
@@ -76,20 +75,6 @@ def test_an_unguarded_main_with_a_pool_is_an_error_after_a_few_tries(
 @pytest.mark.parametrize(
     ("make", "error", "words"),
     [
-        (lambda: fiber.Pool(0), ValueError, "processes"),
-        (lambda: fiber.Pool(-1), ValueError, "processes"),
-        (lambda: fiber.Pool(2, initializer=cast(Any, 1)), TypeError, "initializer"),
-        (lambda: fiber.Pool(2, maxtasksperchild=0), ValueError, "maxtasksperchild"),
-        (lambda: fiber.Pool(2, retries=-1), ValueError, "retries"),
-        (lambda: fiber.Pool(2, task_timeout=0), ValueError, "task_timeout"),
-        (lambda: fiber.Pool(min_workers=3, max_workers=2), ValueError, "max_workers"),
-        (lambda: fiber.Pool(2, max_workers=4), (TypeError, ValueError), "processes"),
-        (lambda: fiber.Pool(min_workers=cast("Any", 1.5)), TypeError, "min_workers.*1.5"),
-        (lambda: fiber.Pool(max_workers=cast("Any", "2")), TypeError, "max_workers.*'2'"),
-        (lambda: fiber.Pool(2, retries=True), TypeError, "retries.*True"),
-        (lambda: fiber.Pool(2, task_timeout=cast("Any", "3")), TypeError, "task_timeout.*'3'"),
-        (lambda: fiber.Pool(2, idle_timeout=cast("Any", "x")), TypeError, "idle_timeout.*'x'"),
-        (lambda: fiber.Pool(2, task_timeout=math.nan), ValueError, "task_timeout.*nan"),
         (lambda: Connection(cast("Any", 0)), TypeError, "multiprocessing.connection.Connection"),
         (lambda: fiber.Process(group=cast("Any", 1)), AssertionError, "group"),
         (lambda: fiber.Semaphore(-1), OSError, "value"),

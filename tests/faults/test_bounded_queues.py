@@ -1,4 +1,4 @@
-"""Bounded queues: the places of processes that are killed come back."""
+"""Queues whose processes are killed: items stay, and the places of a bounded queue come back."""
 
 from __future__ import annotations
 
@@ -41,6 +41,21 @@ def kill(process: fiber.Process) -> None:
     process.kill()
     process.join(PATIENCE)
     process.close()
+
+
+def test_a_killed_reader_takes_only_the_item_that_it_has() -> None:
+    queue: Any = fiber.Queue()
+    ours, theirs = fiber.Pipe()
+    for number in range(20):
+        queue.put(number)
+    reader = fiber.Process(target=targets.get_one_and_block, args=(queue, theirs))
+    reader.start()
+    assert ours.recv() == 0
+    kill(reader)
+    assert [queue.get(timeout=PATIENCE) for _ in range(19)] == list(range(1, 20))
+    for end in (ours, theirs, queue):
+        end.close()
+    queue.join_thread()
 
 
 def test_a_process_killed_while_it_pickles_has_no_place() -> None:

@@ -33,6 +33,7 @@ GARBAGE = [
     b"GET / HTTP/1.1\r\nHost: x\r\n\r\n",
     b"\xff" * 5000,
     os.urandom(1 << 16),
+    pickle.dumps("let me in"),
     b"\x00SP\x00\x00\x11\x00\x00" + bytes(8) + b"\xff" * 64,  # as nng greets, then nonsense
 ]
 
@@ -232,6 +233,7 @@ def test_garbage_at_the_hubs_socket_harms_no_process(door: str, data: bytes) -> 
         except OSError:
             heard = b""
     assert b"key" not in heard.replace(b"wrong key", b"")
+    assert bytes(fiber.current_process().authkey) not in heard
     works()
 
 

@@ -108,6 +108,12 @@ def announce_and_sleep(path: Path) -> None:
     time.sleep(600)
 
 
+def announce_and_spin(path: Path) -> NoReturn:
+    announce(path)
+    while True:
+        pass
+
+
 def wait_if_first(task: tuple[int, Path]) -> int:
     """Wait, as task 0, for an action that needs the other tasks' results."""
     index, gate = task
@@ -149,6 +155,11 @@ def die(how: str) -> NoReturn:
         os.kill(os.getpid(), signal.SIGSEGV)
     os.kill(os.getpid(), signal.SIGKILL)
     raise AssertionError("still alive")
+
+
+def speak_and_die() -> NoReturn:
+    print("about to die", file=sys.stderr, flush=True)
+    die("kill")
 
 
 def die_if(task: tuple[int, int]) -> int:
@@ -365,11 +376,15 @@ class Point:
         return Point(self.x * factor)
 
 
-def pool_of_pools(n: int) -> list[int]:
+def nested_pools(depth: int) -> int:
+    """Return how many pools are one within the other below this task."""
     import fiber
 
-    with fiber.Pool(2) as inner:
-        return inner.map(square, range(n))
+    if depth == 0:
+        return 0
+    with fiber.Pool(1) as pool:
+        deeper: int = pool.apply(nested_pools, (depth - 1,))
+    return 1 + deeper
 
 
 def current_name(_: object = None) -> tuple[str, bool]:

@@ -1,4 +1,4 @@
-"""The pool's calls on local workers: results, order, signatures, input, extras."""
+"""Calls of a pool on each backend: results, order, signatures, input, extras."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ from census import wait_until
 from fiber.pool import Pool
 from patience import PATIENCE
 from processes import pool_tasks as tasks
+
+pytestmark = pytest.mark.usefixtures("backend")
 
 
 @pytest.fixture
@@ -71,6 +73,9 @@ def test_none_is_a_result(pool: Pool) -> None:
     assert list(pool.imap(tasks.identity, [None, 1, None])) == [None, 1, None]
     assert pool.map(tasks.identity, [None] * 5) == [None] * 5
     assert pool.apply(tasks.identity, (None,)) is None
+    naps = [0.05, 0, 0, 0.02, 0, 0]
+    assert list(pool.imap(time.sleep, naps)) == [None] * len(naps)
+    assert list(pool.imap_unordered(time.sleep, naps)) == [None] * len(naps)
 
 
 @pytest.mark.parametrize("source", [[], (), range(0), "", iter([])])
@@ -99,6 +104,12 @@ def test_large_arguments_and_results(pool: Pool) -> None:
         back = pool.map(tasks.identity, arrays, chunksize)
         assert all((a == b).all() for a, b in zip(arrays, back, strict=True))
     assert (pool.apply(tasks.identity, (arrays[1],)) == arrays[1]).all()
+
+
+@pytest.mark.parametrize("size", [1 << 20, (1 << 20) + 1, 5 << 20])
+def test_messages_around_a_megabyte(pool: Pool, size: int) -> None:
+    assert pool.map(len, [bytes(size)] * 3) == [size] * 3
+    assert pool.apply(bytes, (size,)) == bytes(size)
 
 
 def test_an_object_with_very_many_buffers(pool: Pool) -> None:
@@ -160,8 +171,8 @@ def test_stop_iteration_in_a_task_is_an_error_like_any_other(pool: Pool) -> None
 
 
 def test_a_second_get_gives_the_same_again(pool: Pool) -> None:
-    result = pool.apply_async(tasks.identity, ([1],))
-    assert result.get(PATIENCE) is result.get(PATIENCE)
+    for result in (pool.apply_async(tasks.identity, ([1],)), pool.map_async(abs, [-1, -2])):
+        assert result.get(PATIENCE) is result.get(PATIENCE)
     failed = pool.apply_async(tasks.raise_value_error, (1,))
     with pytest.raises(ValueError, match="1") as first:
         failed.get(PATIENCE)
@@ -432,13 +443,16 @@ def test_tasks_in_one_message_do_not_wait_for_each_other(pool: Pool, tmp_path: P
         gate.unlink()
 
 
-def test_as_many_tasks_as_workers_run_at_once(pool: Pool, tmp_path: Path) -> None:
+@pytest.mark.parametrize("chunksize", [None, 1])
+def test_as_many_tasks_as_workers_run_at_once(
+    pool: Pool, tmp_path: Path, chunksize: int | None
+) -> None:
     for attempt in range(3):
         path, gate = tmp_path / f"here{attempt}", tmp_path / f"gate{attempt}"
-        result = pool.starmap_async(tasks.announce_and_wait, [(path, gate)] * 3, 1)
+        result = pool.starmap_async(tasks.announce_and_wait, [(path, gate)] * 8, chunksize)
         assert len(set(tasks.wait_until_announced(path, 3))) == 3
         gate.touch()
-        assert result.get(PATIENCE) == [gate.name] * 3
+        assert result.get(PATIENCE) == [gate.name] * 8
 
 
 def test_short_calls_pass_a_long_map(pool: Pool, tmp_path: Path) -> None:
@@ -477,7 +491,7 @@ def test_workers_are_named_and_daemonic(pool: Pool) -> None:
 
 
 def test_pools_in_pools(pool: Pool) -> None:
-    assert pool.map(tasks.pool_of_pools, [3, 4]) == [[0, 1, 4], [0, 1, 4, 9]]
+    assert pool.map(tasks.nested_pools, [1, 2]) == [1, 2]
 
 
 def test_several_pools_and_threads_at_once() -> None:

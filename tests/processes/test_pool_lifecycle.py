@@ -24,17 +24,22 @@ from patience import PATIENCE
 from processes import pool_tasks as tasks
 from processes.pool_programs import ENVIRON, is_alive, run_program, wait_until
 
+on_each_backend = pytest.mark.usefixtures("backend")
+
 # The end
 
 
-def test_close_lets_everything_be_done() -> None:
+@on_each_backend
+def test_close_lets_everything_be_done_once(tmp_path: Path) -> None:
     pool = fiber.Pool(2)
     results = [pool.apply_async(tasks.nap_and_return, (n,)) for n in range(100)]
+    counted = pool.map_async(tasks.count, [tmp_path / str(n) for n in range(50)], chunksize=1)
     mapped = pool.map_async(tasks.square, range(100))
     iterator = pool.imap(tasks.square, iter(range(100)))
     pool.close()
     pool.join()
     assert [result.get(0) for result in results] == list(range(100))
+    assert counted.get(0) == [1] * 50
     assert mapped.get(0) == list(iterator) == [x * x for x in range(100)]
     assert pool._pool == []
 
@@ -62,6 +67,7 @@ def test_join_does_not_wait_for_results_to_be_consumed() -> None:
     assert list(iterator) == [x * x for x in range(50)]
 
 
+@on_each_backend
 def test_a_closed_pool_accepts_no_call() -> None:
     pool = fiber.Pool(1)
     pool.close()
@@ -83,6 +89,7 @@ def test_join_before_close_is_an_error() -> None:
     pool.join()
 
 
+@on_each_backend
 def test_terminate_is_prompt_and_ends_every_wait() -> None:
     pool = fiber.Pool(3)
     results = [pool.apply_async(tasks.sleep, (600,)) for _ in range(5)]
@@ -104,6 +111,7 @@ def test_terminate_is_prompt_and_ends_every_wait() -> None:
             iterator.next(PATIENCE)
 
 
+@on_each_backend
 @pytest.mark.slow
 def test_terminate_ends_workers_that_ignore_sigterm(tmp_path: Path) -> None:
     pool = fiber.Pool(1)
@@ -115,6 +123,7 @@ def test_terminate_ends_workers_that_ignore_sigterm(tmp_path: Path) -> None:
     pool.join()
 
 
+@on_each_backend
 def test_terminate_twice_and_after_close() -> None:
     pool = fiber.Pool(1)
     pool.close()

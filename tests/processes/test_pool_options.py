@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -32,6 +33,13 @@ def pool() -> Iterator[Pool]:
         ({"maxtasksperchild": 0.5}, ValueError, "maxtasksperchild must be a positive int or None"),
         ({"maxtasksperchild": "9"}, ValueError, "maxtasksperchild must be a positive int or None"),
         ({"initializer": 1}, TypeError, "initializer must be a callable"),
+        ({"processes": 2, "max_workers": 4}, (TypeError, ValueError), "processes"),
+        ({"min_workers": 1.5}, TypeError, "min_workers.*1.5"),
+        ({"max_workers": "2"}, TypeError, "max_workers.*'2'"),
+        ({"retries": True}, TypeError, "retries.*True"),
+        ({"task_timeout": "3"}, TypeError, "task_timeout.*'3'"),
+        ({"idle_timeout": "x"}, TypeError, "idle_timeout.*'x'"),
+        ({"task_timeout": math.nan}, ValueError, "task_timeout.*nan"),
         ({"processes": 2, "min_workers": 1}, ValueError, "processes="),
         ({"min_workers": 3, "max_workers": 2}, ValueError, "min_workers=3"),
         ({"min_workers": -1, "max_workers": 2}, ValueError, "min_workers=-1"),
@@ -45,7 +53,7 @@ def pool() -> Iterator[Pool]:
         ({"retry_exceptions": int}, TypeError, "retry_exceptions"),
     ],
 )
-def test_bad_options_are_named(options: dict[str, Any], error: type[Exception], text: str) -> None:
+def test_bad_options_are_named(options: dict[str, Any], error: Any, text: str) -> None:
     with pytest.raises(error, match=text):
         fiber.Pool(**options)
 
