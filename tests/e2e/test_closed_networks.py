@@ -1,8 +1,9 @@
-"""Workers whose network is closed, as the chart's NetworkPolicy for them says."""
+"""Networks that are closed: nothing passes but what the chart and docs/kubernetes.md ask for."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from urllib.parse import urlsplit
 
 import pytest
@@ -10,6 +11,7 @@ import yaml
 
 from cluster.filters import Allowed
 from e2e.clusters import Cluster
+from e2e.cordons import cordoned
 from e2e.kube import Body, path_of
 from e2e.leftovers import leaves_nothing
 from e2e.program import Programs
@@ -29,7 +31,8 @@ def test_workers_reach_only_their_program(
     operator = release.pod()
     programs.node = operator["spec"]["nodeName"]  # the other node is the workers'
     (node, *_) = (name for name in cluster.workers() if name != programs.node)
-    targets = [metrics_of(operator), *api_servers(scene, cluster)]
+    servers = list(api_servers(scene, cluster))
+    targets = [metrics_of(operator), *servers]
     settings = {
         "listen_port": PORT,
         "node_selector": f"kubernetes.io/hostname={node}",
@@ -41,13 +44,52 @@ def test_workers_reach_only_their_program(
     peer = SAME_NAMESPACE if place == "inside" else {"ipBlock": {"cidr": host}}
     policy = workers_policy(release, scene.namespace, peer)
     scene.kube.create(path_of("networkpolicies", scene.namespace), policy)
-    with cluster.closed(node) as allow:
-        for packets in egress(policy, {str(SAME_NAMESPACE): host}):
-            allow(packets)
+    assert "ingress" not in policy["spec"]
+    with ExitStack() as closed:
+        if place == "inside":
+            ports = [int(server.rpartition(":")[2]) for server in servers]
+            passing = [*operator_egress(release, ports), *program_traffic(host, ports)]
+            release.note_refusals()  # reads metrics, which a closed network prevents
+            closed.enter_context(open_only_to(passing, cluster, programs.node))
+            restart_operator(release, scene, cluster)
+        passing = [*egress(policy, {str(SAME_NAMESPACE): host})]
+        closed.enter_context(open_only_to(passing, cluster, node))
         assert program.says("closed", seconds=90)["reached"] == []
         program.says("done", seconds=90)
         program.ends()
         leaves_nothing(program)
+
+
+@contextmanager
+def open_only_to(passing: Iterable[Allowed], cluster: Cluster, node: str) -> Iterator[None]:
+    """Close the node meanwhile; of new connections of its pods only these pass."""
+    with cluster.closed(node) as allow:
+        for packets in passing:
+            allow(packets)
+        yield
+
+
+def restart_operator(release: Release, scene: Scene, cluster: Cluster) -> None:
+    """Have an operator on the same node all of whose connections are new."""
+    node = release.pod()["spec"]["nodeName"]
+    others = [name for name in cluster.workers() if name != node]
+    with cordoned(scene.kube, *others):
+        release.scale(0)
+        release.wait("no operator", lambda: not release.pods())
+        release.start()
+
+
+def operator_egress(release: Release, ports: Sequence[int]) -> Iterator[Allowed]:
+    """Yield what the chart's policy lets out of the operator's pod."""
+    values = {"networkPolicy": {"create": True, "apiServer": {"ports": list(ports)}}}
+    return egress(rendered_policy(release, values), {})
+
+
+def program_traffic(host: str, ports: Sequence[int]) -> Iterator[Allowed]:
+    """Yield what docs/kubernetes.md asks for: the API server, and workers at the listen_port."""
+    yield Allowed(host, "tcp", PORT)
+    for port in ports:
+        yield Allowed(protocol="tcp", port=port)
 
 
 def metrics_of(operator: Body) -> str:
@@ -73,7 +115,11 @@ def workers_policy(release: Release, namespace: str, master: Body) -> Body:
         "masters": [master],
         "masterPorts": [PORT],
     }
-    manifests = yaml.safe_load_all(release.render({"workerNetworkPolicy": values}))
+    return rendered_policy(release, {"workerNetworkPolicy": values})
+
+
+def rendered_policy(release: Release, values: Body) -> Body:
+    manifests = yaml.safe_load_all(release.render(values))
     (policy,) = (found for found in manifests if found and found["kind"] == "NetworkPolicy")
     return dict(policy)
 
@@ -81,7 +127,6 @@ def workers_policy(release: Release, namespace: str, master: Body) -> Body:
 def egress(policy: Body, peers: Mapping[str, str]) -> Iterator[Allowed]:
     """Yield what the policy lets out; ``peers`` has the addresses of pods that it selects."""
     assert policy["spec"]["policyTypes"] == ["Ingress", "Egress"]
-    assert "ingress" not in policy["spec"]
     for rule in policy["spec"]["egress"]:
         for peer in rule.get("to", [{"ipBlock": {"cidr": "0.0.0.0/0"}}]):
             address = peer["ipBlock"]["cidr"] if "ipBlock" in peer else peers[str(peer)]

@@ -54,12 +54,16 @@ def test_tasks_that_end_in_time_run_once(programs: Programs, scene: Scene) -> No
     leaves_nothing(program)
 
 
+@pytest.mark.parametrize(
+    ("grace", "seconds"), [(6, 20), pytest.param(30, 60, marks=pytest.mark.long)]
+)
 def test_tasks_that_do_not_end_in_time_run_elsewhere(
-    programs: Programs, scene: Scene, tmp_path: Path
+    grace: int, seconds: int, programs: Programs, scene: Scene, tmp_path: Path
 ) -> None:
+    """No task may be retried after a death, and each may be moved once."""
     template = tmp_path / "template.json"
-    template.write_text(json.dumps({"spec": {"terminationGracePeriodSeconds": 6}}))
-    program = start(programs, tasks=WORKERS, seconds=20, disruptions=1, template=template)
+    template.write_text(json.dumps({"spec": {"terminationGracePeriodSeconds": grace}}))
+    program = start(programs, tasks=WORKERS, seconds=seconds, disruptions=1, template=template)
     began = tasks_under_way(scene, program)
     with drained(scene, node_of(scene, began[-1][1])) as pods:
         scene.wait("the status counts the linked workers", lambda: connected(scene), 60)
