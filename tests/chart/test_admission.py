@@ -86,7 +86,7 @@ def test_values_allow_accounts_and_capabilities(helm: Helm) -> None:
         assert len(refusals(policy, with_more(TEMPLATE, more))) == 1
 
 
-def test_it_holds_where_the_operator_works_and_no_label_excepts(helm: Helm) -> None:
+def test_the_policy_covers_the_operators_namespaces_except_labelled_ones(helm: Helm) -> None:
     values = {"scope": "namespaced", "namespaces": ["lab"], "admissionPolicy": {"create": True}}
     binding = named(helm.render(values), f"{POLICY}Binding")["spec"]
     label, namespace = binding["matchResources"]["namespaceSelector"]["matchExpressions"]

@@ -19,7 +19,9 @@ def generated() -> dict[str, Any]:
     return document
 
 
-def test_it_is_the_generated_one(helm: Helm, generated: dict[str, Any]) -> None:
+def test_the_rendered_resource_type_is_the_generated_one(
+    helm: Helm, generated: dict[str, Any]
+) -> None:
     rendered = named(helm.render(), "CustomResourceDefinition")
     assert rendered["metadata"]["name"] == generated["metadata"]["name"]
     assert rendered["spec"] == generated["spec"]
@@ -32,5 +34,5 @@ def test_an_upgrade_updates_the_crd_and_an_uninstall_keeps_it(helm: Helm) -> Non
     assert not is_hook(rendered)
 
 
-def test_it_can_be_left_to_others(helm: Helm) -> None:
+def test_the_chart_can_leave_out_the_resource_type(helm: Helm) -> None:
     assert "CustomResourceDefinition" not in kinds(helm.render({"crds": {"install": False}}))

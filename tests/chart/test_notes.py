@@ -48,7 +48,7 @@ def test_the_notes_name_the_watched_namespaces(helm: Helm) -> None:
     assert "watches the namespaces team-a, team-b, and no other." in helm.notes(TWO)
 
 
-def test_it_warns_where_users_of_pools_may_reach_the_operator(helm: Helm) -> None:
+def test_the_notes_warn_where_users_of_pools_can_reach_the_operator(helm: Helm) -> None:
     warning = "WARNING: the operator serves the namespace that it runs in."
     advice = f"Give no account the role fiber-user in {NAMESPACE}"
     own, everywhere, apart = helm.notes({"scope": "namespaced"}), helm.notes(), helm.notes(TWO)

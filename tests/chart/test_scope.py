@@ -89,7 +89,7 @@ def test_the_rights_are_the_same_in_each_scope(helm: Helm) -> None:
     [(CLUSTER, ["kube-public"]), (OWN, [NAMESPACE]), (TWO, ["team-a", "team-b"])],
     ids=["cluster", "own", "two"],
 )
-def test_it_shows_that_it_serves_where_programs_may_look(
+def test_the_operator_may_write_its_serving_lease_where_programs_read_it(
     helm: Helm, values: dict[str, Any], places: list[str]
 ) -> None:
     manifests = helm.render(values)

@@ -98,7 +98,7 @@ def failure(pools: Pools, patience: float = 15, tolerance: float = 15) -> str:
     return str(failed.value)
 
 
-def test_it_says_each_step_once_and_deletes_the_pool() -> None:
+def test_the_smoke_test_prints_each_step_once_and_deletes_the_pool() -> None:
     pools = Pools(STARTING, STARTING, {**STARTING, "problems": [PULLING]}, READY)
     assert run(pools) == [
         "made the FiberPool smoke-x in namespace ns",

@@ -86,7 +86,7 @@ def test_lint_reports_no_problem(helm: Helm, values: dict[str, Any]) -> None:
     assert "0 chart(s) failed" in helm.lint(values)
 
 
-def test_as_part_of_another_chart(helm: Helm) -> None:
+def test_the_chart_renders_as_part_of_another_chart(helm: Helm) -> None:
     helm.render({"global": {"anything": {"goes": 1}}})
 
 

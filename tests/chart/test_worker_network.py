@@ -18,7 +18,7 @@ def policy(helm: Helm, **values: Any) -> dict[str, Any]:
     return dict(found[0]["spec"])
 
 
-def test_it_closes_the_pods_of_workers(helm: Helm) -> None:
+def test_the_policy_closes_the_pods_of_workers(helm: Helm) -> None:
     spec = policy(helm)
     (label,) = spec["podSelector"]["matchExpressions"]
     assert label == {"key": names.LABEL_POOL_UID, "operator": "Exists"}

@@ -49,7 +49,7 @@ def test_a_process_left_behind_fails_the_group_and_is_killed() -> None:
     assert results(report) == {FAULTY: "pass", "TestSimpleQueue.<left behind>": "fail"}
 
 
-def test_a_module_that_cannot_be_loaded_is_said_at_once() -> None:
+def test_a_module_that_cannot_be_loaded_is_reported_at_once() -> None:
     target = Target("no_such_module", "spawn", frozenset({"core"}), 60)
     with pytest.raises(RuntimeError, match="No module named 'no_such_module'"):
         list_cases(target)

@@ -93,7 +93,7 @@ BY_VALUE: Mapping[str, Callable[[Programs], str]] = {
 
 @pytest.mark.timeout(LIMIT)
 @pytest.mark.parametrize("start", IMPORTED.values(), ids=IMPORTED.keys())
-def test_of_a_program_that_children_import(
+def test_children_import_the_program_without_its_guarded_part(
     programs: Programs, start: Callable[[Programs], str]
 ) -> None:
     output = start(programs)
@@ -102,20 +102,20 @@ def test_of_a_program_that_children_import(
 
 @pytest.mark.timeout(LIMIT)
 @pytest.mark.parametrize("start", BY_VALUE.values(), ids=BY_VALUE.keys())
-def test_of_a_program_that_they_do_not(
+def test_functions_of_a_program_that_children_do_not_import_travel_by_value(
     programs: Programs, start: Callable[[Programs], str]
 ) -> None:
     assert start(programs) == ONCE + RESULT
 
 
 @pytest.mark.timeout(LIMIT)
-def test_such_a_program_needs_no_guard(tmp_path: Path) -> None:
+def test_a_program_from_standard_input_needs_no_guard(tmp_path: Path) -> None:
     unguarded = DEFINITIONS + CALL
     assert Programs(tmp_path, "local").run(input=unguarded) == ONCE + RESULT
 
 
 @pytest.mark.timeout(LIMIT)
-def test_under_a_debugger(programs: Programs) -> None:
+def test_a_program_under_a_debugger_prints_its_result(programs: Programs) -> None:
     output = programs.run("-m", "pdb", "-c", "continue", "program.py", input="quit\n")
     assert RESULT in output.replace("top level of __mp_main__\n", "")
 
@@ -159,20 +159,20 @@ def _read_to_the_end(terminal: IO[bytes]) -> str:
 
 @pytest.mark.timeout(LIMIT)
 @pytest.mark.parametrize("terminal", ["xterm", "dumb"])
-def test_of_an_interactive_session(programs: Programs, terminal: str) -> None:
+def test_an_interactive_session_can_start_processes(programs: Programs, terminal: str) -> None:
     shown = typed(programs, "-q", TERM=terminal)
     assert RESULT in shown, shown
 
 
 @pytest.mark.timeout(LIMIT)
-def test_of_a_session_that_follows_a_program(programs: Programs) -> None:
+def test_an_interactive_session_after_a_program_can_start_processes(programs: Programs) -> None:
     (programs.folder / "before.py").touch()
     shown = typed(programs, "-i", "before.py", TERM="dumb")
     assert RESULT in shown, shown
 
 
 @pytest.mark.timeout(LIMIT)
-def test_of_a_notebook(programs: Programs) -> None:
+def test_a_notebook_can_start_processes(programs: Programs) -> None:
     for name, cell in (("first", DEFINITIONS), ("second", CALL)):
         (programs.folder / name).write_text(cell)
     assert programs.run("-m", "jupyter_client.runapp", "first", "second") == ONCE + RESULT

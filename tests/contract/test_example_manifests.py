@@ -40,7 +40,7 @@ def unknown(document: Any, node: dict[str, Any], path: str) -> list[str]:
     return own + inner
 
 
-def test_they_are_all_there() -> None:
+def test_the_example_manifests_are_complete() -> None:
     assert [path.stem for path in MANIFESTS] == ["autoscaled", "gpu", "minimal", "warm"]
 
 

@@ -160,7 +160,7 @@ def test_garbage_in_the_status_is_left_out_and_named(path: str) -> None:
             assert pool.status.phase == "Scaling"
 
 
-def test_one_bad_item_does_not_cost_the_others() -> None:
+def test_an_invalid_condition_is_skipped_and_reported() -> None:
     broken = changed(pool_of(FULL_SPEC, FULL_STATUS), {"status.conditions[0].status": "Perhaps"})
     pool = FiberPool.read(broken)
     assert [condition.type for condition in pool.status.conditions] == ["Accepted"]

@@ -81,7 +81,7 @@ def test_a_stale_file_is_named(monkeypatch: pytest.MonkeyPatch, capsys: Any) -> 
     )
 
 
-def test_it_is_small_enough_to_be_applied() -> None:
+def test_the_resource_type_is_small_enough_for_kubectl_apply() -> None:
     assert len(manifest().encode()) < MAX_SIZE
 
 
@@ -193,7 +193,7 @@ RULES = [
 RULE_IDS = [rule["rule"] for _, rule in RULES]
 
 
-def test_there_are_rules() -> None:
+def test_the_schema_has_at_least_ten_rules() -> None:
     assert len(RULES) >= 10
 
 

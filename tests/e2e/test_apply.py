@@ -159,7 +159,7 @@ def test_suspend_and_resume(pool: Pool, agent: Body) -> None:
     assert pool.status["failures"].get("total", 0) == 0
 
 
-def test_a_worker_that_somebody_deletes_is_replaced(pool: Pool, agent: Body) -> None:
+def test_a_worker_that_a_user_deletes_is_replaced(pool: Pool, agent: Body) -> None:
     scene = pool.scene
     pool.apply(agent, minReplicas=2)
     victim, other = pool.ready(2)

@@ -72,7 +72,7 @@ def test_an_image_that_cannot_be_pulled(pools: Pools) -> None:
     is_told_soon(pool, waits_for("ImagePullBackOff"), "ImagePullError", severity="Error")
 
 
-def test_it_is_read_with_kubectl(pools: Pools) -> None:
+def test_kubectl_shows_the_problem_of_a_pool(pools: Pools) -> None:
     pool = pools["bad-image"]
     pool.has_problem("ImagePullError", severity="Error", seconds=60)
     read = yaml.safe_load(pool.kubectl("get", "fiberpool", pool.name, "--output", "yaml"))
@@ -96,7 +96,7 @@ def test_a_corrected_image_heals_the_pool(pools: Pools, agent: Body) -> None:
     assert pool.condition("Degraded")["status"] == "False"
 
 
-def test_an_image_name_that_is_none(pools: Pools) -> None:
+def test_an_invalid_image_name_is_a_terminal_problem(pools: Pools) -> None:
     pool = pools["bad-name"]
     problem = pool.has_problem("InvalidImageName", severity="Error", terminal=True)
     assert says(problem["message"], problem["pod"], "Correct the image in spec.template")

@@ -59,7 +59,7 @@ def test_a_program_works_under(
     leaves_nothing(program)
 
 
-def test_a_program_works_beside_sidecars(
+def test_a_worker_that_ends_before_its_sidecar_is_replaced(
     programs: Programs, scene: Scene, cluster: Cluster, image: str, tmp_path: Path
 ) -> None:
     """A worker has ended though the other container of its pod has not."""

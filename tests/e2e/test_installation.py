@@ -85,7 +85,9 @@ def small(
         release.start()
 
 
-def test_one_namespace_is_enough(small: Release, pool: Pool, agent: Body, kube: Kube) -> None:
+def test_an_operator_with_rights_in_one_namespace_serves_it(
+    small: Release, pool: Pool, agent: Body, kube: Kube
+) -> None:
     small.install({"scope": "namespaced", "crds": {"install": False}})
     pool.apply(agent, minReplicas=1).ready(1)
     labels = {"labelSelector": small.selector}

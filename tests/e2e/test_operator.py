@@ -100,7 +100,7 @@ def test_no_worker_is_lost_with_the_api_server(
     assert status["ready"]
 
 
-def test_of_two_operators_one_acts(pool: Pool, agent: Body, release: Release) -> None:
+def test_a_second_operator_waits_and_takes_over(pool: Pool, agent: Body, release: Release) -> None:
     first = release.pod()
     release.scale(2)
     try:

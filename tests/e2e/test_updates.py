@@ -71,7 +71,7 @@ def test_recreate_replaces_all_at_once(pool: Pool, lone_agent: Body) -> None:
     assert revisions(pool) == {pool.status["templateHash"]}
 
 
-def test_on_delete_waits_for_somebody(pool: Pool, agent: Body) -> None:
+def test_on_delete_updates_only_pods_that_a_user_deletes(pool: Pool, agent: Body) -> None:
     on_delete = {"update": {"strategy": "OnDelete"}, "minReplicas": 2}
     pool.apply(agent, **on_delete)
     first, second = pool.ready(2)

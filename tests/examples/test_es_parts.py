@@ -55,7 +55,7 @@ def test_evolution_climbs(es: Any) -> None:
     np.testing.assert_allclose(search.theta, top, atol=0.2)
 
 
-def test_one_table_however_many_make_it_at_once(
+def test_threads_that_open_the_table_at_once_share_one_file(
     es: Any, temporary: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """All start before the first one ends, and all end up with the same file."""

@@ -27,7 +27,7 @@ def train(backend: str, picture: Path, *, envs: int, updates: int) -> list[float
     return [float(mean) for mean in returns]
 
 
-def test_it_learns_the_same_wherever_the_environments_are(tmp_path: Path) -> None:
+def test_the_learning_curve_is_the_same_on_each_backend(tmp_path: Path) -> None:
     here, there = (train(kind, tmp_path / "curve.png", envs=3, updates=30) for kind in BACKENDS)
     assert here == there
     assert here[-1] > 1.2 * here[0]

@@ -22,7 +22,9 @@ def printed(program: str, module: str, backend: str = "local") -> str:
 
 
 @pytest.mark.parametrize("program", ["poet.py", "subproc_vec_env.py", "stable_baselines3_envs.py"])
-def test_they_print_the_same(program: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_programs_print_the_same_as_with_multiprocessing(
+    program: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     if program.startswith("stable") and importlib.util.find_spec("stable_baselines3") is None:
         pytest.skip("make installs stable-baselines3")
     if importlib.util.find_spec("torch") is None:

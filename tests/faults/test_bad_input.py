@@ -102,7 +102,7 @@ NO_NUMBER = """
 
 
 @pytest.mark.parametrize("processes", [2.5, "4", True])
-def test_a_number_of_processes_that_is_none(
+def test_an_invalid_number_of_processes_is_refused_as_in_multiprocessing(
     launch: Callable[..., Program], processes: object
 ) -> None:
     assert launch(NO_NUMBER.format(processes=processes)).rest() == "True\n"

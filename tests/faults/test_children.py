@@ -53,7 +53,7 @@ def ended(child: Any) -> int:
         ("SIGINT", 1),  # KeyboardInterrupt, which multiprocessing reports as any exception
     ],
 )
-def test_its_exit_code_says_how_it_ended(method: str, way: str, code: int) -> None:
+def test_the_exit_code_of_a_child_says_how_it_ended(method: str, way: str, code: int) -> None:
     assert ended(started(targets.exit_by, way, method=method)) == code
 
 
@@ -100,7 +100,7 @@ def test_a_stopped_child_can_be_killed_and_goes_on_when_continued(pipe: tuple[An
     assert ended(child) == -signal.SIGKILL
 
 
-def test_one_that_ignores_sigterm_is_ended_by_kill(pipe: tuple[Any, Any]) -> None:
+def test_a_child_that_ignores_sigterm_is_ended_by_kill(pipe: tuple[Any, Any]) -> None:
     child = started(targets.ignore_sigterm, pipe[1])
     assert pipe[0].recv() == "ready"
     child.terminate()
@@ -111,14 +111,14 @@ def test_one_that_ignores_sigterm_is_ended_by_kill(pipe: tuple[Any, Any]) -> Non
     assert ended(child) == -signal.SIGKILL
 
 
-def test_one_that_handles_sigterm_ends_as_it_likes(pipe: tuple[Any, Any]) -> None:
+def test_a_child_that_handles_sigterm_chooses_its_exit_code(pipe: tuple[Any, Any]) -> None:
     child = started(targets.exit_on_sigterm, pipe[1])
     assert pipe[0].recv() == "ready"
     child.terminate()
     assert ended(child) == 42
 
 
-def test_one_that_closes_all_its_descriptors_is_reported_all_the_same(
+def test_the_end_of_a_child_that_closed_all_its_descriptors_is_reported(
     pipe: tuple[Any, Any],
 ) -> None:
     child = started(targets.close_every_descriptor, pipe[1])

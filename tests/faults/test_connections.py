@@ -80,7 +80,7 @@ def test_a_waiting_receiver_is_woken_by_the_death(
     killer.join()
 
 
-def test_it_comes_only_when_the_last_of_many_holders_is_gone(
+def test_end_of_file_comes_when_the_last_holder_is_gone(
     pipe: tuple[Any, Any], start: Callable[..., Any]
 ) -> None:
     ours, theirs = pipe
@@ -151,7 +151,7 @@ def test_a_sender_blocked_on_a_full_pipe_learns_that_the_reader_died(
     assert isinstance(errors[0], BrokenPipeError)
 
 
-def test_a_bulky_send_whose_reader_dies_unread_does_not_wait_for_ever(
+def test_a_large_send_ends_when_its_reader_dies(
     pipe: tuple[Any, Any], start: Callable[..., Any]
 ) -> None:
     ours, theirs = pipe

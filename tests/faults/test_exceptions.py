@@ -106,14 +106,14 @@ def test_retry_exceptions_know_it(backend: str) -> None:
         heard(lambda: pool.apply(diverge, (STEP,)))
 
 
-def test_one_whose_attributes_raise_is_an_error_and_no_death(backend: str) -> None:
+def test_an_exception_whose_attributes_raise_does_not_end_the_worker(backend: str) -> None:
     with fiber.Pool(1) as pool:
         with pytest.raises(MaybeEncodingError, match="Unreadable"):
             pool.apply(raise_unreadable)
         assert pool.apply(abs, (-1,)) == 1
 
 
-def test_one_that_holds_a_handle(backend: str) -> None:
+def test_an_exception_may_hold_a_handle(backend: str) -> None:
     queue: Any = fiber.Queue()
     with fiber.Pool(1) as pool, pytest.raises(ValueError, match="holds a handle") as caught:
         pool.apply(raise_with, (queue,))
@@ -122,7 +122,9 @@ def test_one_that_holds_a_handle(backend: str) -> None:
     assert queue.get(timeout=PATIENCE) == STEP
 
 
-def test_of_main(launch_on: Callable[..., Program]) -> None:
+def test_exceptions_of_the_main_module_keep_their_class_and_attributes(
+    launch_on: Callable[..., Program],
+) -> None:
     """Also of a ``__main__`` that its agents cannot import."""
     program = launch_on(
         """

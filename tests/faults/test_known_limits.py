@@ -43,7 +43,7 @@ def test_a_task_reaches_other_processes_of_its_user() -> None:
 
 
 @pytest.mark.usefixtures("local")
-def test_one_proxy_opens_its_whole_manager() -> None:
+def test_a_proxy_gives_access_to_all_objects_of_its_manager() -> None:
     with managers.SyncManager() as manager:
         mine: Any = manager.list()
         others: Any = manager.dict(secret=7)

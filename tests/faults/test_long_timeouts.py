@@ -40,7 +40,7 @@ def works(pool: Any) -> bool:
 
 @LONG
 @pytest.mark.parametrize("name", ["task_timeout", "idle_timeout"])
-def test_of_a_pool(name: str, long: float) -> None:
+def test_a_pool_accepts_long_timeouts(name: str, long: float) -> None:
     options: dict[str, Any] = {name: long}
     with fiber.Pool(min_workers=0, max_workers=2, **options) as pool:
         assert works(pool)
@@ -48,7 +48,7 @@ def test_of_a_pool(name: str, long: float) -> None:
 
 
 @LONG
-def test_of_a_call_and_its_result(long: float) -> None:
+def test_calls_and_results_accept_long_timeouts(long: float) -> None:
     with fiber.Pool(2) as pool:
         assert pool.apply_async(abs, (-1,), timeout=long).get(long) == 1
         assert pool.map_async(abs, [-1], timeout=long).get(long) == [1]
@@ -94,7 +94,7 @@ def test_shared_objects_accept_long_timeouts(
 
 
 @LONG
-def test_of_a_join(long: float) -> None:
+def test_join_accepts_long_timeouts(long: float) -> None:
     child = fiber.Process(target=targets.nothing)
     child.start()
     child.join(long)
@@ -103,12 +103,12 @@ def test_of_a_join(long: float) -> None:
 
 
 @pytest.mark.parametrize("backend", ["local", "loopback"])
-def test_of_a_start(backend: str) -> None:
+def test_a_start_accepts_long_timeouts(backend: str) -> None:
     with running(backend=backend, agents=1, start_timeout=1e7), fiber.Pool(1) as pool:
         assert works(pool)
 
 
-def test_of_agents() -> None:
+def test_agents_accept_long_timeouts() -> None:
     patience = {"heartbeat_interval": 1e7, "suspect_after": 2e7, "lost_after": 4e7}
     with running(backend="loopback", agents=1, **patience), fiber.Pool(1) as pool:
         assert works(pool)

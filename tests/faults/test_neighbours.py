@@ -44,7 +44,7 @@ DAEMON = "daemon = fiber.Process(target=targets.block, daemon=True); daemon.star
 
 @pytest.mark.parametrize("before", ["pass", "use('before the fork')", DAEMON])
 @pytest.mark.parametrize("end", ["sys.exit(code)", "os._exit(code)"])
-def test_a_program_that_forks_itself_uses_it_in_both(
+def test_a_program_that_forks_itself_uses_fiber_in_both(
     launch: Callable[..., Program], before: str, end: str
 ) -> None:
     after = "print(daemon.is_alive())" if before == DAEMON else "pass"
@@ -54,7 +54,9 @@ def test_a_program_that_forks_itself_uses_it_in_both(
     assert program.stderr == ""
 
 
-def test_one_that_has_agents_does_too(launch: Callable[..., Program]) -> None:
+def test_a_program_with_agents_that_forks_itself_uses_fiber_in_both(
+    launch: Callable[..., Program],
+) -> None:
     script = FORKS.format(before=DAEMON, end="sys.exit(code)", after="print(daemon.is_alive())")
     program = launch(script, env=LOOPBACK)
     assert program.finish() == "0 0 0\nTrue\n"
@@ -91,7 +93,9 @@ BESIDE_MULTIPROCESSING = """
 
 
 @pytest.mark.parametrize("method", ["fork", "spawn", "forkserver"])
-def test_multiprocessing_beside_it(launch: Callable[..., Program], method: str) -> None:
+def test_multiprocessing_works_in_the_same_program(
+    launch: Callable[..., Program], method: str
+) -> None:
     env = LOOPBACK if method == "fork" else {}
     program = launch(BESIDE_MULTIPROCESSING.format(method=method), env=env)
     assert program.finish() == "9\n0 True\n[1] [2]\n['Process']\n-15 []\n"

@@ -372,7 +372,7 @@ def test_an_image_that_cannot_be_had_is_an_error_within_seconds(
     assert "ErrImageNeverPull" in capfd.readouterr().err
 
 
-def test_a_fiber_pool_that_somebody_deletes_is_said_and_the_next_pool_has_another(
+def test_the_deletion_of_a_fiber_pool_is_reported_and_the_next_pool_gets_another(
     cluster: FakeCluster, capfd: pytest.CaptureFixture[str]
 ) -> None:
     with running(backend="kubernetes"):
@@ -387,7 +387,7 @@ def test_a_fiber_pool_that_somebody_deletes_is_said_and_the_next_pool_has_anothe
     assert capfd.readouterr().err.count("was deleted, and its processes with it") == 1
 
 
-def test_a_map_whose_fiber_pool_somebody_deletes_goes_on_with_another(
+def test_a_map_whose_fiber_pool_is_deleted_goes_on_with_another(
     cluster: FakeCluster,
 ) -> None:
     # The next one listens at the same port.
@@ -418,7 +418,7 @@ def test_processes_for_which_there_will_be_no_room_are_spoken_of(
     assert capfd.readouterr().err.count("processes wait until others end") == 1
 
 
-def test_a_pool_on_somebody_elses_pods_leaves_them_as_they_were(cluster: FakeCluster) -> None:
+def test_a_pool_on_a_warm_pool_leaves_its_pods_unchanged(cluster: FakeCluster) -> None:
     template = {"spec": {"containers": [{"name": "worker", "image": "worker"}]}}
     cluster.do(lambda: cluster.world.make_pool("warm", "lab", minReplicas=2, template=template))
     cluster.wait(lambda: len(cluster.world.pods("lab")) == 2)
@@ -433,7 +433,7 @@ def test_a_pool_on_somebody_elses_pods_leaves_them_as_they_were(cluster: FakeClu
     cluster.do(cluster.world.store.delete, "fiberpools", "lab", "warm")
 
 
-def test_an_outdated_pod_of_somebody_elses_is_replaced_when_it_is_idle(
+def test_an_outdated_pod_of_a_warm_pool_is_replaced_when_it_is_idle(
     cluster: FakeCluster,
 ) -> None:
     template = {"spec": {"containers": [{"name": "worker", "image": "worker:1"}]}}
@@ -539,7 +539,7 @@ FORKS = """
 
 
 @pytest.mark.usefixtures("cluster")
-def test_a_program_that_forks_itself_has_pods_and_its_copy_runs_beside_it(
+def test_a_program_with_pods_can_fork_itself(
     launch: Callable[..., Program],
 ) -> None:
     program = launch(FORKS, env={"FIBER_BACKEND": "kubernetes"})

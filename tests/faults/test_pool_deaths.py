@@ -267,7 +267,7 @@ def test_an_initializer_that_raises_ends_the_pool_after_few_tries(tmp_path: Path
 
 
 @pytest.mark.usefixtures("_impatient")
-def test_outstanding_calls_hear_of_it() -> None:
+def test_outstanding_calls_fail_when_no_worker_starts() -> None:
     pool = fiber.Pool(2, tasks.start_slowly, (Path("/nowhere"),))
     results = [pool.apply_async(tasks.square, (n,)) for n in range(3)]
     iterator = pool.imap(tasks.square, iter(range(10)))
@@ -287,7 +287,7 @@ def test_outstanding_calls_hear_of_it() -> None:
 
 
 @pytest.mark.usefixtures("_impatient")
-def test_workers_that_die_at_birth_are_not_tried_for_ever(tmp_path: Path) -> None:
+def test_a_pool_gives_up_after_three_workers_that_die_at_their_start(tmp_path: Path) -> None:
     path = tmp_path / "runs"
     pool = fiber.Pool(1, tasks.vanish, (path,))
     with pytest.raises(StartError, match="exit status 9"):

@@ -103,7 +103,7 @@ def test_nowhere_to_write_is_said_when_something_is_shared(
     assert program.left() == []
 
 
-def test_a_runtime_directory_that_is_none_is_named(
+def test_a_runtime_directory_that_is_a_file_is_named(
     launch: Callable[..., Program], folder: Path
 ) -> None:
     file = folder / "file"

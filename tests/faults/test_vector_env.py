@@ -47,7 +47,7 @@ def works(env: VectorEnv) -> None:
     assert env.step([GOOD] * 4)[0].tolist() == [[1]] * 4
 
 
-def test_one_that_raises(vector_env: Make) -> None:
+def test_an_error_of_an_environment_names_its_step_and_worker(vector_env: Make) -> None:
     env = vector_env()
     with pytest.raises(ArithmeticError, match="a bad action") as caught:
         env.step([GOOD, GOOD, Faulty.RAISE, Faulty.RAISE])
@@ -62,7 +62,7 @@ def test_one_that_raises(vector_env: Make) -> None:
     works(env)
 
 
-def test_one_that_raises_is_made_anew(vector_env: Make) -> None:
+def test_an_environment_that_raises_is_replaced(vector_env: Make) -> None:
     env = vector_env(on_error="restart")
     env.step([GOOD] * 4)
     with pytest.warns(RuntimeWarning, match="environment 2 replaced: step raised Arithm"):
@@ -84,7 +84,9 @@ def test_one_that_raises_is_made_anew(vector_env: Make) -> None:
 
 
 @pytest.mark.parametrize("action", [Faulty.EXIT, Faulty.SEGFAULT])
-def test_one_that_ends_its_worker(action: int, backend: str, vector_env: Make) -> None:
+def test_an_environment_that_ends_its_worker_raises_worker_died(
+    action: int, backend: str, vector_env: Make
+) -> None:
     env = vector_env()
     with pytest.raises(fiber.WorkerDied) as caught:
         env.step([GOOD, GOOD, GOOD, action])
@@ -122,7 +124,7 @@ def test_a_worker_that_died_is_started_anew(mode: str, vector_env: Make) -> None
     works(env)
 
 
-def test_one_that_hangs(vector_env: Make) -> None:
+def test_an_environment_that_hangs_raises_a_timeout_error(vector_env: Make) -> None:
     env = vector_env(timeout=2)
     with pytest.raises(fiber.TimeoutError, match=r"longer than 2 s") as caught:
         env.step([GOOD, Faulty.HANG, GOOD, GOOD])
@@ -130,7 +132,7 @@ def test_one_that_hangs(vector_env: Make) -> None:
     works(env)
 
 
-def test_one_that_hangs_is_made_anew(vector_env: Make) -> None:
+def test_an_environment_that_hangs_is_replaced(vector_env: Make) -> None:
     env = vector_env(timeout=2, on_error="restart")
     with pytest.warns(RuntimeWarning, match=r"environment 1 replaced: .*longer than 2 s"):
         observations, _, _, truncations, _ = env.step([GOOD, Faulty.HANG, GOOD, GOOD])
@@ -195,7 +197,9 @@ def test_a_worker_that_dies_in_a_call(vector_env: Make) -> None:
     works(env)
 
 
-def test_one_that_kills_each_worker_is_given_up(vector_env: Make, tmp_path: Path) -> None:
+def test_an_environment_that_kills_each_worker_is_given_up(
+    vector_env: Make, tmp_path: Path
+) -> None:
     last = tmp_path / "last"
     env = vector_env(partial(Faulty, last=last), on_error="restart")
     last.touch()
@@ -219,7 +223,7 @@ def test_an_answer_that_cannot_be_pickled(vector_env: Make) -> None:
     assert np.isfinite(env.step([GOOD] * 4)[0]).all()
 
 
-def test_one_whose_answer_cannot_be_pickled_is_made_anew(vector_env: Make) -> None:
+def test_an_environment_whose_answer_cannot_be_pickled_is_replaced(vector_env: Make) -> None:
     env = vector_env(on_error="restart")
     with pytest.warns(RuntimeWarning, match="environment 3 replaced: step raised TypeError"):
         _, rewards, _, truncations, infos = env.step([GOOD, GOOD, GOOD, Faulty.UNPICKLABLE])
@@ -231,7 +235,7 @@ def test_one_whose_answer_cannot_be_pickled_is_made_anew(vector_env: Make) -> No
 
 
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-def test_one_whose_observation_cannot_be_pickled_is_made_anew(
+def test_an_environment_whose_observation_cannot_be_pickled_is_replaced(
     vector_env: Make, mode: AutoresetMode
 ) -> None:
     env = vector_env(Telling, on_error="restart", autoreset_mode=mode)
@@ -252,7 +256,7 @@ class NeverPicklable(Faulty):
         return observation, {"lock": threading.Lock()}
 
 
-def test_one_whose_answers_can_never_be_pickled_is_given_up(backend: str) -> None:
+def test_an_environment_whose_answers_can_never_be_pickled_is_given_up(backend: str) -> None:
     env = VectorEnv([Faulty, NeverPicklable], num_workers=1, on_error="restart")
     with pytest.raises(TypeError, match="cannot pickle") as caught:
         env.reset()

@@ -116,7 +116,7 @@ def pool(launch: Callable[..., Program], tmp_path: Path) -> Pool:
     return Pool(launch, tmp_path)
 
 
-def test_it_waits_for_its_first_master_for_longer_than_agents_of_a_run(pool: Pool) -> None:
+def test_a_warm_agent_waits_longer_than_its_grace_for_its_first_master(pool: Pool) -> None:
     agent = pool.agent(grace=0.1)
     with pytest.raises(AssertionError, match="still runs"):
         agent.wait(1.0)
@@ -205,7 +205,7 @@ def test_credentials_from_a_file_serve_for_all_its_masters(pool: Pool, tmp_path:
         master.kill()
 
 
-def test_it_serves_where_the_kernel_does_not_hide_it_and_says_so(pool: Pool) -> None:
+def test_an_agent_that_the_kernel_does_not_hide_serves_and_warns(pool: Pool) -> None:
     refused = """
     from fiber._agent import main as agent_main
     agent_main.hide_this_process = lambda: False
@@ -229,7 +229,7 @@ def test_an_agent_that_cannot_find_the_tasks_files_serves_no_second_master(pool:
     assert agent.left() == []
 
 
-def test_it_finds_the_next_master_when_the_last_was_killed(pool: Pool) -> None:
+def test_a_warm_agent_finds_the_next_master_after_the_last_was_killed(pool: Pool) -> None:
     agent = pool.agent(grace=30)
     for _ in range(2):
         master = pool.master()
@@ -250,7 +250,7 @@ def test_a_stranger_at_the_address_of_a_lost_master_is_not_the_end(pool: Pool) -
     assert pool.master().line() == "joined warm-0"
 
 
-def test_it_ends_when_no_master_comes_after_a_lost_one(pool: Pool) -> None:
+def test_a_warm_agent_ends_when_no_master_follows_a_lost_one(pool: Pool) -> None:
     agent = pool.agent(grace=0.5)
     master = pool.master()
     assert master.line() == "joined warm-0"

@@ -402,7 +402,7 @@ def test_a_port_in_use_is_named_and_leaves_no_process() -> None:
     assert len(os.listdir("/proc/self/fd")) == before
 
 
-def test_an_address_that_is_not_ours_is_named() -> None:
+def test_an_address_of_another_host_is_named() -> None:
     with (
         pytest.raises(LinkError, match=r"203\.0\.113\.7:0: this machine"),
         running(listen_host="203.0.113.7"),

@@ -19,7 +19,7 @@ def test_the_executor_keeps_the_promises_of_a_pool(part: int) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("part", range(PARTS))
-def test_it_keeps_them_over_real_links_to_real_agent_services(part: int) -> None:
+def test_the_executor_keeps_its_promises_over_real_links_to_real_agent_services(part: int) -> None:
     examine_part("remote", part)
 
 

@@ -99,7 +99,7 @@ FAULTS: dict[str, tuple[str, str, Any]] = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", FAULTS)
-def test_it_finds(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_injected_fault_is_found(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
     kind, name, instead = FAULTS[fault]
     if instead is None:
         monkeypatch.setattr(World, "sleep", lambda world, _: world.monotonic())

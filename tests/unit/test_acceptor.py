@@ -223,7 +223,7 @@ class _BreaksAfterTheCheck(socket.socket):
         return found
 
 
-def test_one_that_breaks_as_it_is_taken_stays_open_nowhere(site: Site) -> None:
+def test_a_connection_that_breaks_during_its_handshake_is_closed(site: Site) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         other = socket.create_connection(server.getsockname(), PATIENCE)
         accepted, _ = server.accept()

@@ -364,7 +364,9 @@ class TestDuration:
     def module(self, library: Library) -> Any:
         return library("import multiprocessing\nfrom multiprocessing import Queue")
 
-    def test_as_a_context_manager_it_ends_with_the_block(self, module: Any, fiber: Any) -> None:
+    def test_an_adoption_as_context_manager_ends_with_its_block(
+        self, module: Any, fiber: Any
+    ) -> None:
         with Adoption(module, fiber) as adopted:
             assert adopted is module
             assert module.Queue is Queue

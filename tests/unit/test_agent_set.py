@@ -81,7 +81,7 @@ def test_children_that_wait_are_refused_when_the_last_agent_goes_for_good(
     assert [owner.report and owner.report.cause for _, owner in running] == [Cause.AGENT_LOST] * 2
 
 
-def test_an_agent_that_is_let_go_is_none_to_wait_for(site: Site) -> None:
+def test_a_new_child_fails_if_no_agent_is_left(site: Site) -> None:
     site.placement.remove(site.join("a"))
     site.agents.fail(ERROR)
     child, _ = site.start()

@@ -102,7 +102,9 @@ def test_others_are_found_on_the_path_and_in_pyenv(tmp_path: Path, bare: dict[st
     assert python_script("find", OTHERS[1], **bare) == [str(inside)]
 
 
-def test_one_that_can_make_no_environment_is_none(tmp_path: Path, bare: dict[str, str]) -> None:
+def test_a_python_that_cannot_make_an_environment_is_not_chosen(
+    tmp_path: Path, bare: dict[str, str]
+) -> None:
     for version in SUPPORTED:
         fake_python(tmp_path / "bin" / f"python{version}", version, whole=False)
     assert python_script("others", sys.executable, **bare) == []

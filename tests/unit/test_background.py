@@ -27,7 +27,7 @@ def names() -> list[str]:
     return [thread.name for thread in threading.enumerate()]
 
 
-def test_it_does_things_in_order_on_one_daemon_thread(thread: BackgroundThread) -> None:
+def test_background_work_runs_in_order_on_one_daemon_thread(thread: BackgroundThread) -> None:
     seen: list[tuple[int, threading.Thread]] = []
     for n in range(100):
         assert thread.submit(lambda n: seen.append((n, threading.current_thread())), n)
@@ -62,7 +62,7 @@ def test_a_thread_that_the_system_has_no_room_for_is_started_when_there_is(
     assert seen == [2]
 
 
-def test_one_that_was_never_needed_ends_at_once() -> None:
+def test_an_unused_background_thread_ends_at_once() -> None:
     thread = BackgroundThread("test-background")
     thread.stop()
     thread.join()
@@ -109,7 +109,7 @@ def test_an_exception_is_shown_and_does_not_stop_the_thread(
     assert (shown, seen) == ([kind], [1])
 
 
-def test_its_work_may_stop_and_join_it(thread: BackgroundThread) -> None:
+def test_background_work_may_stop_and_join_its_thread(thread: BackgroundThread) -> None:
     done = threading.Event()
 
     def end() -> None:
@@ -121,7 +121,7 @@ def test_its_work_may_stop_and_join_it(thread: BackgroundThread) -> None:
     assert done.wait(PATIENCE)
 
 
-def test_it_keeps_no_reference_to_finished_work(thread: BackgroundThread) -> None:
+def test_a_background_thread_keeps_no_reference_to_finished_work(thread: BackgroundThread) -> None:
     class Held:
         def use(self) -> None:
             pass

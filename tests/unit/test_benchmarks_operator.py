@@ -84,7 +84,7 @@ apiserver_request_total_of_something_else{verb="POST",resource="pods"} 70
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_both_subjects_make_the_same_pods(case: Case) -> None:
+def test_the_fiber_pool_and_the_replica_set_make_the_same_pods(case: Case) -> None:
     pool, replica_set = (subject.manifest("x", case.size) for subject in SUBJECTS)
     assert replica_set["spec"]["replicas"] == case.size
     assert pool["spec"]["template"]["spec"] == replica_set["spec"]["template"]["spec"]
@@ -475,7 +475,7 @@ def test_an_unknown_case_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert "no case '10'; there are 1000, 100x10, 5000" in capsys.readouterr().err
 
 
-def test_the_page_of_floods_has_the_delay_beside_that_without_one() -> None:
+def test_the_page_of_floods_compares_delays_with_and_without_a_flood() -> None:
     usual = floods.Measured([0.5, 0.5, 2.0], changes=10, seconds=2.0, memory=9e7)
     flooded = floods.Measured([1.0, 1.0, 3.0], changes=10, seconds=2.0, memory=2.5e8)
     page = floods.page(ABOUT, dict.fromkeys(floods.FLOODS, usual) | {"large": flooded})

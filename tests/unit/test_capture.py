@@ -115,7 +115,7 @@ def test_the_writer_waits_while_the_link_is_behind_and_no_output_is_lost(
     captured.hang_up()
 
 
-def test_a_process_that_writes_for_ever_does_not_delay_the_end(captured: Captured) -> None:
+def test_a_process_that_writes_without_end_does_not_delay_the_end(captured: Captured) -> None:
     flood = subprocess.Popen(["yes"], stdout=captured.out)
     captured.hang_up()
     captured.wait_for(1000)

@@ -65,7 +65,7 @@ def test_tiny_tasks_are_not_spread_thinner_than_the_floor() -> None:
     assert pace(1e-6).batch_size(1000, 100) == int(FLOOR / 1e-6)
 
 
-def test_one_long_task_among_short_ones_is_soon_forgotten() -> None:
+def test_a_long_task_among_short_ones_lowers_the_batch_size_briefly() -> None:
     known = pace(1e-7)
     known.observe(1, 100.0)
     assert known.batch_size(MANY, 1) == 1

@@ -155,7 +155,7 @@ def test_a_process_of_our_pods_is_known_by_its_cgroup(cgroup: str, ours: bool) -
     assert cgroups.holds_a_pod(cgroup) is ours
 
 
-def test_a_shim_is_ours_if_its_containerd_is() -> None:
+def test_a_shim_belongs_to_the_cluster_whose_containerd_it_names() -> None:
     shim = b"/usr/bin/containerd-shim-runc-v2"
     socket = str(places.socket(1)).encode()
     assert remains.is_shim([shim, b"-namespace", b"k8s.io", b"-address", socket])

@@ -130,7 +130,9 @@ def test_a_build_that_fails_is_done_again(builder: Notebook, checkout: Path) -> 
     assert builder.asked[3:] == [references["fiber-worker"], references["fiber-worker-rl"]]
 
 
-def test_an_image_on_top_of_ours_follows_it(builder: Notebook, checkout: Path) -> None:
+def test_an_image_is_built_again_when_its_base_image_changes(
+    builder: Notebook, checkout: Path
+) -> None:
     first = images.build(SEARCH)
     worker = WORKER.archived()
     assert worker is not None

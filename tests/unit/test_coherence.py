@@ -62,7 +62,7 @@ def test_writers_of_neighbouring_bytes_do_not_meet() -> None:
     assert pair.home == pair.other == b"\1\2" * (SIZE // 2)
 
 
-def test_of_two_that_write_the_same_byte_the_home_decides() -> None:
+def test_the_home_decides_about_a_byte_that_both_sides_wrote() -> None:
     pair = Pair()
     pair.home[0], pair.other[0] = 1, 2
     (down,), (up,) = list(pair.up.collect()), list(pair.down.collect())

@@ -161,7 +161,7 @@ class TestSources:
         [entry for entry in dataclasses.fields(Config) if entry.default is None],
         ids=lambda entry: entry.name,
     )
-    def test_none_is_the_default_of_a_key_that_has_no_other(
+    def test_none_gives_a_key_its_default(
         self, entry: dataclasses.Field[object], monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setenv(f"FIBER_{entry.name.upper()}", "/tmp")
@@ -214,7 +214,7 @@ class TestUnknownKeys:
         ("variable", "meant"),
         [("FIBER_AGENT_ADRESS", "FIBER_AGENT_ADDRESS"), ("FIBER_AGENT_COUNT", "FIBER_AGENTS")],
     )
-    def test_variables_beside_those_of_an_agent_get_suggestions(
+    def test_misspelt_variables_of_an_agent_get_suggestions(
         self, variable: str, meant: str
     ) -> None:
         with pytest.raises(ConfigError, match=f"{variable}. Did you mean '{meant}'?"):
@@ -237,7 +237,7 @@ class TestUnknownKeys:
             load(environ={"FIBER_QUIET": "3"})  # the prefix that it shares with all others is long
         assert "Did you mean" not in str(caught.value)
 
-    def test_it_can_be_caught_as_value_error_and_as_fibers(self) -> None:
+    def test_a_config_error_is_a_value_error_and_a_fiber_error(self) -> None:
         with pytest.raises(ValueError, match="zzz"):
             load({"zzz": 3})
         assert issubclass(ConfigError, FiberError)
@@ -514,7 +514,9 @@ class TestConfig:
 class TestKeysOfTheOriginal:
     """Users of uber's Fiber hear what to write in place of what they have."""
 
-    def test_its_file(self, tmp_path: Path) -> None:
+    def test_a_file_of_the_original_fiber_is_an_error_with_replacements(
+        self, tmp_path: Path
+    ) -> None:
         text = "[default]\nbackend=kubernetes\nlog_file=stdout\nkubernetes_namespace=rl\n"
         (tmp_path / ".fiberconfig").write_text(text)
         with pytest.raises(ConfigError) as caught:
@@ -527,13 +529,15 @@ class TestKeysOfTheOriginal:
         assert lines[2] == "kubernetes_namespace: Set namespace."
 
     @pytest.mark.parametrize("text", ["no section", "[other]\nbackend=local", "\0"])
-    def test_its_file_with_a_fault(self, text: str, tmp_path: Path) -> None:
+    def test_an_unreadable_file_of_the_original_fiber_is_an_error(
+        self, text: str, tmp_path: Path
+    ) -> None:
         (tmp_path / ".fiberconfig").write_text(text)
         with pytest.raises(ConfigError, match="They cannot be read"):
             load()
 
     @pytest.mark.parametrize("key", sorted(_config_sources.REPLACEMENTS))
-    def test_its_keys_have_a_replacement_in_each_source(
+    def test_each_key_of_the_original_fiber_is_an_error_in_each_source(
         self, key: str, pyproject: Callable[[str], Path]
     ) -> None:
         variable = f"FIBER_{key.upper()}"

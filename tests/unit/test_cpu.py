@@ -78,7 +78,7 @@ def test_the_tightest_group_around_the_process_counts(machine: Machine) -> None:
     assert machine.quota() == 2
 
 
-def test_groups_beside_the_process_do_not_count(machine: Machine) -> None:
+def test_limits_of_other_cgroups_do_not_count(machine: Machine) -> None:
     top = machine.mount("cgroup2", "unified")
     limit_v2(top / "other", "100000 100000")
     limit_v2(top / "mine", "300000 100000")
@@ -121,7 +121,7 @@ def test_group_above_the_cgroup_namespace(machine: Machine) -> None:
     assert machine.quota() == 2
 
 
-def test_both_versions_at_once(machine: Machine) -> None:
+def test_a_limit_of_cgroup_version_1_counts_beside_version_2(machine: Machine) -> None:
     limit_v1(machine.mount("cgroup", "cpu", options="rw,cpu"), 250_000)
     machine.mount("cgroup2", "unified")
     machine.groups += ["1:cpu:/", "0::/"]

@@ -155,7 +155,7 @@ def test_other_content_of_a_descriptor_is_refused_and_not_repeated(value: bytes)
 
 
 @pytest.mark.parametrize("descriptor", [-1, 10**6, 10**12])
-def test_a_descriptor_that_is_none_is_named(descriptor: int) -> None:
+def test_an_invalid_descriptor_is_named(descriptor: int) -> None:
     with pytest.raises(ConfigError, match=f"descriptor {descriptor} cannot be read"):
         Credentials.from_descriptor(descriptor)
 

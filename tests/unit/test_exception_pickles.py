@@ -69,7 +69,7 @@ def count_pickles(error: BaseException, functions: tuple[str, ...]) -> int:
     ],
     ids=lambda value: type(value).__name__ if isinstance(value, BaseException) else "",
 )
-def test_its_class_its_arguments_and_its_attributes(
+def test_an_exception_keeps_its_class_arguments_and_attributes(
     error: BaseException, attributes: tuple[str, ...]
 ) -> None:
     vars(error)["__notes__"] = ["on the device"]
@@ -182,13 +182,13 @@ def test_a_member_that_has_its_group() -> None:
     assert first.group.exceptions == (first, first)
 
 
-def test_one_that_has_another_and_itself() -> None:
+def test_an_exception_that_contains_another_and_itself_travels() -> None:
     found = travelled(kinds.Wraps(kinds.BadlyReduced(3, 0.5), step=2))
     assert (type(found.inner), found.inner.step, found.step) == (kinds.BadlyReduced, 3, 2)
     assert found.inner.outer is found
 
 
-def test_one_whose_class_is_local_to_a_function() -> None:
+def test_an_exception_of_a_local_class_travels() -> None:
     found = travelled(kinds.local(3))
     assert (type(found).__name__, found.args, found.step) == ("Local", ("local",), 3)
 
@@ -253,7 +253,7 @@ def test_an_exception_that_cannot_be_rebuilt_becomes_a_maybe_encoding_error() ->
     assert "Hopeless: no hope" in str(found.__cause__)
 
 
-def test_one_whose_attributes_raise_says_so() -> None:
+def test_an_exception_whose_attributes_raise_becomes_a_maybe_encoding_error() -> None:
     found = travelled(kinds.Unreadable("closed"))
     assert type(found) is MaybeEncodingError
     assert "Unreadable('closed')" in str(found)

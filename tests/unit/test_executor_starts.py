@@ -17,7 +17,7 @@ from processes import pool_tasks as tasks
 from unit.executor_rig import Rig
 
 
-def test_one_that_cannot_wait_for_anything_has_ended() -> None:
+def test_an_executor_that_cannot_start_has_ended() -> None:
     rig = Rig(2, start=False, ready=False)
 
     def refuse(dependent: object) -> NoReturn:

@@ -30,7 +30,9 @@ OURS = Identity("the master", PROTOCOL, "3.11.7", "1.0", {"host": "here"})
         MasterRefusal(OURS, "no such session"),
     ],
 )
-def test_there_and_back(greeting: AgentHello | MasterWelcome | MasterRefusal) -> None:
+def test_encoded_messages_decode_to_equal_ones(
+    greeting: AgentHello | MasterWelcome | MasterRefusal,
+) -> None:
     assert decode_greeting(greeting.encode()) == greeting
 
 
@@ -100,7 +102,7 @@ def test_versions_must_fit(theirs: Identity, complaint: str | None) -> None:
     assert complaint is None or str(error).startswith(complaint)
 
 
-def test_this_process_names_its_versions() -> None:
+def test_the_identity_of_this_process_has_its_versions() -> None:
     identity = Identity.of_this_process("agent-1", host="here")
     assert identity.protocol == PROTOCOL
     assert identity.facts == {"host": "here"}

@@ -69,7 +69,7 @@ def test_a_forgotten_block_is_used_again_and_is_zero() -> None:
     assert again.view == bytes(1000)
 
 
-def test_one_that_left_the_process_is_not_used_again() -> None:
+def test_a_block_that_was_pickled_is_not_reused() -> None:
     hosts = Hosts()
     try:
         with hosts.at("one"):
@@ -83,7 +83,7 @@ def test_one_that_left_the_process_is_not_used_again() -> None:
         hosts.close()
 
 
-def test_one_that_there_was_at_a_fork_is_not_used_again() -> None:
+def test_a_block_from_before_a_fork_is_not_reused() -> None:
     block = allocate(1000)
     identity = block.identity
     pid = os.fork()

@@ -87,7 +87,7 @@ def test_collected_grants_end_with_the_set(hosts: Hosts) -> None:
         assert wait_until(lambda: objects_kept(hub) == 0, PATIENCE)
 
 
-def test_grants_collected_in_vain_are_released(hosts: Hosts) -> None:
+def test_grants_of_a_failed_pickling_are_released(hosts: Hosts) -> None:
     with hosts.at("a") as hub:
         _, end = fiber.Pipe()
         with pytest.raises(TypeError, match="pickle"), collecting_grants() as collected:
@@ -133,7 +133,7 @@ def test_a_pickling_that_failed_leaves_no_grant(hosts: Hosts) -> None:
         pickle.loads(kept)
 
 
-def test_one_object_takes_one_descriptor_however_often_it_is_shared(hosts: Hosts) -> None:
+def test_an_object_keeps_its_descriptors_when_it_is_shared_again(hosts: Hosts) -> None:
     with hosts.at("a") as hub, collecting_grants() as collected:
         queue = fiber.Queue()
         assert hub.address  # its socket takes one
@@ -392,9 +392,7 @@ def test_objects_that_a_child_shares_outlive_it(hosts: Hosts, child: Connection)
             borrowed.recv()
 
 
-def test_children_lend_to_each_other_without_the_hubs_process_in_between(
-    hosts: Hosts, child: Connection
-) -> None:
+def test_children_of_a_host_share_objects_without_the_hub(hosts: Hosts, child: Connection) -> None:
     with hosts.child_at("a"):
         child.send("lend")
         borrowed = pickle.loads(child.recv_bytes())

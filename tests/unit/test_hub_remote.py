@@ -125,7 +125,7 @@ def test_poll(far_pipe: tuple[Connection, Connection]) -> None:
         there.recv()
 
 
-def test_one_ended_pipes_stay_so(far: Far) -> None:
+def test_a_pipe_in_one_direction_stays_so_on_another_host(far: Far) -> None:
     reader, writer = fiber.Pipe(duplex=False)
     far_writer = far(writer)
     with pytest.raises(OSError, match="write-only"):

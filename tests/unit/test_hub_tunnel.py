@@ -102,7 +102,7 @@ def test_messages_arrive_whole_and_in_order(shapes: list[list[int]]) -> None:
     ]
 
 
-def test_both_sides_open_tunnels_and_say_where_to() -> None:
+def test_both_sides_can_open_tunnels_to_a_named_host() -> None:
     pair = Pair()
     one, other = pair.agent.open("a"), pair.master.open("b")
     pair.run()
@@ -160,7 +160,7 @@ def test_no_more_than_one_large_message_is_under_way() -> None:
     assert not ours.congested
 
 
-def test_other_tunnels_go_on_beside_a_congested_one() -> None:
+def test_a_congested_tunnel_does_not_delay_others() -> None:
     pair = Pair()
     ours, theirs, _ = pair.open()
     theirs.pause()

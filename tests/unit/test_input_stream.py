@@ -103,7 +103,7 @@ def test_each_grant_brings_it_to_the_bound_and_none_comes_before_half_is_gone() 
     assert reading.stream._granted == 3 * AHEAD
 
 
-def test_it_reads_ahead_further_for_quick_tasks() -> None:
+def test_an_input_stream_reads_further_ahead_for_quick_tasks() -> None:
     slow, quick = Reading(), Reading()
     slow.grant()
     quick.grant(pace=known(1e-5))

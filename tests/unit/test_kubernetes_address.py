@@ -121,6 +121,6 @@ def test_the_way_to_this_machine_is_a_loopback() -> None:
     assert provisioner._local_address("127.0.0.1") == "127.0.0.1"
 
 
-def test_there_is_no_route_to_an_unknown_name(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unknown_name_has_no_local_address(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(socket, "getaddrinfo", nobody)
     assert provisioner._local_address("nobody") is None

@@ -102,7 +102,7 @@ def test_a_context_that_is_not_there(api: Api) -> None:
 
 
 @pytest.mark.parametrize("content", [None, "", "[]", "clusters: 3", "{", "current-context: here"])
-def test_a_kubeconfig_that_is_none(
+def test_an_invalid_kubeconfig_is_named(
     content: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "kubeconfig"
@@ -155,7 +155,7 @@ def test_a_login_plugin_is_asked_again_when_its_token_is_not_accepted(
         api.list(ALL)
 
 
-def test_of_a_kubeconfigs_certificates_no_file_is_left(
+def test_the_certificates_of_a_kubeconfig_leave_no_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The package would delete them when the interpreter exits: before our pools are deleted, and
@@ -202,7 +202,7 @@ def test_a_kubeconfig_that_names_its_files_needs_no_folder_to_write_to(
             api.list(ALL, timeout=0)
 
 
-def test_certificates_that_are_none_are_a_kubeconfig_that_cannot_be_used(
+def test_invalid_certificates_of_a_kubeconfig_are_an_error_that_names_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = kubeconfig(tmp_path, "https://localhost:1", **{"certificate-authority-data": "bm9uZQ=="})

@@ -107,7 +107,7 @@ def test_objects_of_a_pool_are_deleted_with_it(rig: Rig, told: Told) -> None:
 
 @pytest.mark.parametrize("readable", [True, False], ids=["readable", "forbidden"])
 @pytest.mark.parametrize("plural", ["secrets", "leases"])
-def test_an_object_of_somebody_else_is_not_taken_for_the_pools(
+def test_an_object_of_another_owner_is_not_taken_for_the_pools(
     rig: Rig, told: Told, plural: str, readable: bool
 ) -> None:
     """The role fiber-user reads no Secret."""
@@ -214,7 +214,7 @@ def test_an_answer_that_is_lost_while_it_is_born(rig: Rig, told: Told, plural: s
     assert not told.errors
 
 
-def test_the_name_of_somebody_elses_pool(rig: Rig, told: Told) -> None:
+def test_the_name_of_another_programs_pool_is_refused(rig: Rig, told: Told) -> None:
     other = {"metadata": {"name": "es-1"}, "spec": {"master": OTHER.spec("es-1", 1)}}
     rig.server.do(rig.server.store.create, names.PLURAL, NAMESPACE, other)
     client = rig.own(told)
@@ -269,7 +269,7 @@ def test_names_to_release_are_written_until_their_pods_are_gone(
 # -- Notices
 
 
-def test_it_reports_status_and_pods(rig: Rig, told: Told) -> None:
+def test_a_fiber_pool_client_reports_status_and_pods(rig: Rig, told: Told) -> None:
     rig.own(told).demand(1)
     replicas_become(rig, told, 1)
     status = {"observedGeneration": 9, "phase": "Ready"}
@@ -291,7 +291,7 @@ def test_pods_of_other_pools_are_ignored(rig: Rig, told: Told) -> None:
     assert [name for name, _ in told.pods] == ["es-1-a"]
 
 
-def test_a_pool_that_somebody_deletes_is_an_error(rig: Rig, told: Told) -> None:
+def test_the_deletion_of_a_pool_is_an_error(rig: Rig, told: Told) -> None:
     rig.own(told).demand(1)
     replicas_become(rig, told, 1)
     rig.remove(names.PLURAL, "es-1")
@@ -570,7 +570,7 @@ def test_an_interrupted_close_names_the_leftovers_too(
     assert "kubectl delete fiberpool es-1 -n lab" in said
 
 
-def test_no_fault_of_ours_leaves_anybody_waiting(
+def test_a_bug_in_the_client_ends_the_wait_with_an_error(
     rig: Rig, told: Told, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: object, **__: object) -> None:

@@ -62,7 +62,7 @@ def case(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Case]:
         case.end()
 
 
-def test_it_reports_objects_and_their_changes(case: Case) -> None:
+def test_an_informer_reports_objects_and_their_changes(case: Case) -> None:
     case.add("a")
     case.watch.start()
     assert case.next() == ["+a"]
@@ -184,7 +184,7 @@ def test_an_event_that_no_api_server_sends_is_a_fault_and_not_a_silence(case: Ca
     assert isinstance(case.faults.get(timeout=PATIENCE), KeyError)
 
 
-def test_one_that_was_never_started_is_stopped(case: Case) -> None:
+def test_an_informer_that_was_never_started_can_be_stopped(case: Case) -> None:
     case.end()
     assert case.told.empty()
 

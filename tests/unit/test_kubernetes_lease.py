@@ -76,7 +76,7 @@ def test_the_lease_names_holder_start_and_duration(case: Case) -> None:
     assert {**after, "renewTime": ""} == {**before, "renewTime": ""}
 
 
-def test_it_says_how_many_agents_are_linked(case: Case) -> None:
+def test_the_lease_has_the_number_of_linked_agents(case: Case) -> None:
     def said() -> str:
         metadata = case.rig.get("leases", LEASE)["metadata"]
         return str(metadata["annotations"][names.ANNOTATION_CONNECTED])
@@ -87,7 +87,7 @@ def test_it_says_how_many_agents_are_linked(case: Case) -> None:
     assert said() == "12"
 
 
-def test_in_time_it_is_one_call(case: Case) -> None:
+def test_a_renewal_in_time_is_one_call(case: Case) -> None:
     case.rig.server.api.calls.clear()
     case.now += 30
     case.renewer.renew()
@@ -101,13 +101,13 @@ def test_a_connection_that_breaks_once_is_made_again(case: Case) -> None:
     assert case.lease()["renewTime"] > before["renewTime"]
 
 
-def test_one_that_somebody_deleted_is_made_again(case: Case) -> None:
+def test_a_deleted_lease_is_created_again(case: Case) -> None:
     case.rig.remove("leases", LEASE)
     case.renewer.renew()
     assert case.lease()["holderIdentity"] == MASTER.identity
 
 
-def test_none_is_made_for_a_pool_that_is_gone(case: Case) -> None:
+def test_no_lease_is_created_for_a_deleted_pool(case: Case) -> None:
     case.rig.remove(names.PLURAL, "es-1")
     case.rig.server.api.calls.clear()
     with pytest.raises(FiberPoolError) as caught:
@@ -173,7 +173,7 @@ def test_a_failed_renewal_does_not_count(case: Case, monkeypatch: pytest.MonkeyP
     assert case.rig.server.api.count("get", names.PLURAL) == 1
 
 
-def test_it_expires_once_in_each_duration_without_a_renewal(
+def test_a_lease_expires_once_in_each_duration_without_a_renewal(
     case: Case, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fiber_pool, "_TIMEOUT", 0.0)

@@ -41,7 +41,7 @@ def test_objects_are_merged_and_other_values_replaced() -> None:
     assert merged(tolerations=[{"key": "gpu"}])["tolerations"] == [{"key": "gpu"}]
 
 
-def test_none_takes_a_field_away() -> None:
+def test_a_field_that_is_none_is_removed() -> None:
     assert "nodeSelector" not in merged(nodeSelector=None)
     assert merged(nodeSelector={"zone": None})["nodeSelector"] == {}
     assert merged(affinity={"nodeAffinity": None})["affinity"] == {}

@@ -141,7 +141,7 @@ def test_an_eviction_for_the_pods_own_excess_is_no_disruption() -> None:
     assert (ended.reason, ended.disrupted) == (f"Evicted: {message.rstrip('. ')}", False)
 
 
-def test_a_disruption_that_did_not_come_is_none() -> None:
+def test_a_false_disruption_condition_is_ignored() -> None:
     document = pod(phase="Running", disruption=("PreemptionByScheduler", "preempting"))
     document["status"]["conditions"][-1]["status"] = "False"
     assert pod_end(document) is None

@@ -68,7 +68,7 @@ class TestWarnings:
         assert len(list(new_problems(POOL, mild, bad))) == 1
         assert list(new_problems(POOL, bad, mild)) == []
 
-    def test_there_are_none_without_problems(self) -> None:
+    def test_a_status_without_problems_gives_no_warning(self) -> None:
         assert list(new_problems(POOL, status(UNSCHEDULABLE), {})) == []
 
     @pytest.mark.parametrize("reason", ["LeaseNotFound", "MasterLost"])
@@ -167,7 +167,7 @@ class TestUnreachable:
             assert part in str(error)
         assert "its running pod has" in str(unreachable(POOL, status(replicas=1), 8.0, WAY))
 
-    def test_of_a_pool_that_was_taken_over_names_its_last_master(self) -> None:
+    def test_the_error_of_a_pool_that_was_taken_over_names_its_last_master(self) -> None:
         way = AgentRoute("10.0.0.7:41337", displaced="laptop-8:4712")
         told = str(unreachable(POOL, status(replicas=1), 8.0, way))
         assert "Or the pods still serve laptop-8:4712" in told
@@ -201,7 +201,7 @@ class TestSummary:
         assert summary({}, NOW) == "the operator has not looked at it yet"
 
     @pytest.mark.parametrize("since", [None, "yesterday"])
-    def test_a_time_that_is_none_is_left_out(self, since: str | None) -> None:
+    def test_an_invalid_time_is_left_out(self, since: str | None) -> None:
         told = summary(status(problem("Forbidden", "no", since=since), desiredReplicas=1), NOW)
         assert told == "0 of 1 pods ready: Forbidden: no"
 

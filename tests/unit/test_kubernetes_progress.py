@@ -63,7 +63,7 @@ def file(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("terminal")
 class TestOnATerminal:
-    def test_one_line_is_shown_each_second_and_removed(
+    def test_the_progress_line_is_shown_each_second_and_removed(
         self, loop: SimulatedLoop, wait: Progress, said: Said
     ) -> None:
         wait.start()
@@ -74,7 +74,7 @@ class TestOnATerminal:
         assert said.shown[-1][1] == ""
         assert said.written == []
 
-    def test_it_is_no_longer_than_a_line(
+    def test_the_progress_line_is_cut_to_the_width_of_the_terminal(
         self, loop: SimulatedLoop, wait: Progress, said: Said
     ) -> None:
         wait.start()
@@ -132,7 +132,7 @@ class TestElsewhere:
         assert said.shown == []
 
     @pytest.mark.parametrize("stderr", [None, sys.__stderr__])
-    def test_a_stderr_that_is_none_or_closed_is_no_terminal(
+    def test_a_missing_or_closed_stderr_is_not_a_terminal(
         self,
         loop: SimulatedLoop,
         wait: Progress,

@@ -49,7 +49,7 @@ def test_only_the_first_error_of_a_chain_is_reported(told: Told) -> None:
     ]
 
 
-def test_a_fault_of_ours_has_its_cause(told: Told) -> None:
+def test_an_internal_error_has_its_cause(told: Told) -> None:
     errors: list[FiberPoolError] = []
     told.reporter._on_error = errors.append
     fault = KeyError("spec")
@@ -67,7 +67,7 @@ def test_a_lasting_problem_is_reported_once(told: Told) -> None:
     assert told.starts()[1:] == ["warning: cannot watch the"]
 
 
-def test_it_is_news_again_once_it_had_passed(told: Told) -> None:
+def test_a_trouble_that_returns_is_reported_again(told: Told) -> None:
     told.reporter.trouble("scale", ServerUnreachable("no route"))
     told.reporter.answered()
     told.reporter.trouble("scale", ServerUnreachable("no route"))

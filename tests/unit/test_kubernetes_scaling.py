@@ -120,7 +120,7 @@ def test_a_failed_patch_is_tried_again_with_growing_pauses_and_the_newest_demand
 
 
 @pytest.mark.parametrize("kind", [Forbidden, Unauthorized])
-def test_a_refusal_may_pass_but_not_for_ever(case: Case, kind: type[ApiError]) -> None:
+def test_refusals_are_retried_for_a_limited_time(case: Case, kind: type[ApiError]) -> None:
     case.pool.failures = [kind("no") for _ in range(99)]
     case.want(1)
     started = case.now

@@ -90,7 +90,7 @@ class TestTemplates:
         (tmp_path / file).write_text(text)
         assert read_template(str(tmp_path / file)) == GPU
 
-    def test_there_is_none_by_itself(self) -> None:
+    def test_there_is_no_template_by_default(self) -> None:
         assert read_template(None) == {}
 
     @pytest.mark.parametrize(
@@ -128,7 +128,7 @@ class TestTemplates:
         with pytest.raises(ConfigError, match=complaint):
             PodShape.of(Config(template=template))
 
-    def test_a_list_is_none(self, tmp_path: Path) -> None:
+    def test_a_list_is_not_a_template(self, tmp_path: Path) -> None:
         (tmp_path / "pod.yaml").write_text("- spec: {}\n")
         with pytest.raises(ConfigError, match=r"pod\.yaml is not an object with metadata and spec"):
             read_template(str(tmp_path / "pod.yaml"))

@@ -109,7 +109,7 @@ class TestElsewhere:
             "spec": {"containers": [{"name": "worker", "image": WORKER_IMAGE, "command": AGENT}]}
         }
 
-    def test_it_is_named_as_charts_and_builds_name_it(self) -> None:
+    def test_the_worker_image_has_the_same_name_in_chart_build_and_sdk(self) -> None:
         assert images.WORKER.released(places.CHECKOUT) == WORKER_IMAGE
         values = Path(places.CHECKOUT, "charts/fiber-operator/values.yaml").read_text()
         found = re.search(r"^workerImage:\n(?:  #.*\n)*  repository: (\S+)$", values, re.MULTILINE)
@@ -171,7 +171,7 @@ class TestInAPod:
             "matchLabelKeys": [names.LABEL_POOL_UID],
         }
 
-    def test_its_environment_is_the_programs_without_fibers(self) -> None:
+    def test_a_pod_has_the_programs_environment_without_fibers_variables(self) -> None:
         variables = worker_of(like())["env"]
         assert [variable["name"] for variable in variables] == ["SEED", "CPUS"]
         reference = variables[1]["valueFrom"]["resourceFieldRef"]
@@ -208,7 +208,7 @@ class TestInAPod:
         assert worker_of(like(pod=pod))["env"] == variables
         assert secrets_left_out(pod, "main") == []
 
-    def test_it_runs_the_agent_with_the_programs_interpreter(self) -> None:
+    def test_a_pod_runs_the_agent_with_the_programs_interpreter(self) -> None:
         assert worker_of(like())["command"] == [PYTHON, "-m", "fiber.agent"]
 
     def test_in_another_image_it_is_the_one_that_is_found(self) -> None:
@@ -243,7 +243,7 @@ class TestResources:
         shape = PodShape().with_resources(Resources(gpu=1))
         assert worker_of(like(shape))["resources"] == {"limits": {"nvidia.com/gpu": "1"}}
 
-    def test_they_are_those_of_each_process(self) -> None:
+    def test_a_pod_has_the_resources_of_all_its_processes(self) -> None:
         shape = PodShape(processes_per_pod=4).with_resources(Resources(cpu=0.3, memory=100, gpu=2))
         assert worker_of(like(shape))["resources"] == {
             "requests": {"cpu": "1200m", "memory": "400Mi"},

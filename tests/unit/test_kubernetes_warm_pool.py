@@ -170,7 +170,7 @@ def test_the_epoch_is_above_that_of_all_masters_before(rig: Rig, told: Told) -> 
     has_master(rig, told, 8)
 
 
-def test_of_two_that_attach_at_the_same_time_one_is_refused(rig: Rig, told: Told) -> None:
+def test_one_of_two_programs_that_attach_at_the_same_time_is_refused(rig: Rig, told: Told) -> None:
     reads = 0
 
     def other_is_faster(call: object) -> None:
@@ -296,7 +296,9 @@ def test_a_key_that_the_pools_owner_brought(rig: Rig) -> None:
     assert pool_key(rig) == "ab" * 32
 
 
-def test_one_that_was_deleted_is_not_begun_anew(rig: Rig, told: Told) -> None:
+def test_the_error_of_a_deleted_warm_pool_asks_its_owner_to_make_it_again(
+    rig: Rig, told: Told
+) -> None:
     rig.warm(told)
     has_master(rig, told, 1)
     rig.remove(names.PLURAL, "warm")
@@ -313,7 +315,7 @@ def test_a_pool_taken_by_another_program_names_the_wait(rig: Rig, told: Told) ->
     assert "Wait until that program ends" in str(told.error())
 
 
-def test_one_that_this_program_was_detached_from_can_be_attached_to_again(
+def test_the_error_of_a_detached_program_says_that_it_can_attach_again(
     rig: Rig, told: Told
 ) -> None:
     rig.warm(told)

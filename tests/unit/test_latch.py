@@ -30,7 +30,7 @@ def _signals_raise() -> Iterator[None]:
     signal.signal(signal.SIGUSR1, before)
 
 
-def test_it_happens_once_and_stays() -> None:
+def test_a_latch_stays_set() -> None:
     latch = Latch()
     assert not latch.is_set()
     assert not latch.wait(0)
@@ -84,7 +84,9 @@ def test_leaving_while_one_is_released() -> None:
     assert not lock.locked()
 
 
-def test_it_happens_between_a_look_and_the_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_latch_that_is_set_between_check_and_wait_ends_the_wait(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     latch = Latch()
     join = Waiters.join
 

@@ -182,7 +182,7 @@ def test_only_the_running_task_is_charged() -> None:
     assert spans[2][0] == 4
 
 
-def test_of_very_short_tasks_a_stride_is_suspect() -> None:
+def test_a_death_is_charged_to_the_whole_stride_of_very_short_tasks() -> None:
     ledger, (worker,) = ledger_with(1)
     job = job_of(ledger, range(1000), pace=known(1e-5))
     batch, _ = assign_all(ledger)

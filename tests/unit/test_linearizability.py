@@ -119,7 +119,7 @@ FAULTS: dict[str, tuple[list[tuple[str, Any, Any]], Any, Any]] = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_it_finds(fault: str) -> None:
+def test_an_injected_fault_is_found(fault: str) -> None:
     operations, model, state = FAULTS[fault]
     assert not is_linearizable(one_after_another(*operations), model, state)
 
@@ -132,7 +132,7 @@ def test_overlapping_operations_may_have_happened_in_either_order() -> None:
 
 
 @pytest.mark.parametrize("case", ["Lock", "SimpleQueue"])
-def test_it_finds_a_changed_result_in_a_true_history(case: str) -> None:
+def test_a_changed_result_in_a_true_history_is_found(case: str) -> None:
     target, make, model, state = CASES[case]
     seen = history(target, make())
     gets = [n for n, operation in enumerate(seen) if operation.name in ("get", "acquire")]

@@ -28,7 +28,7 @@ def test_a_port_in_use_is_named(site: Site) -> None:
 
 
 @pytest.mark.parametrize("address", ["192.0.2.1:0", "no-such-host.invalid:0"])
-def test_an_address_that_is_not_ours_is_named(site: Site, address: str) -> None:
+def test_an_address_of_another_host_is_named(site: Site, address: str) -> None:
     with pytest.raises(LinkError, match=f"cannot listen on {address}"):
         site.listener(address)
 
@@ -59,7 +59,7 @@ def test_the_dialer_gives_up_without_a_listener(site: Site) -> None:
     )
 
 
-def test_a_name_that_is_none_is_given_up_in_time_and_named(site: Site) -> None:
+def test_a_malformed_name_is_given_up_in_time_and_named(site: Site) -> None:
     _, agent = site.dialer(f"{'x' * 64}.example:80", timeout=0.3)
     agent.wait(lambda: agent.errors)
     assert "within 0.3 s: its name is malformed: " in str(agent.errors[0])

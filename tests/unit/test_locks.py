@@ -79,7 +79,7 @@ def held_elsewhere(lock: Any) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("make", [fiber.Lock, fiber.RLock])
-def test_one_at_a_time(make: Callable[[], Any]) -> None:
+def test_a_lock_has_one_holder_at_a_time(make: Callable[[], Any]) -> None:
     lock = make()
     with held_elsewhere(lock):
         assert not lock.acquire(False)
@@ -169,7 +169,9 @@ def test_an_acquire_without_waiting_gets_it_too(one: SharedSemaphore) -> None:
 
 
 @pytest.mark.parametrize("call", ["_take", "_give"])
-def test_one_that_dies_between_two_steps(one: SharedSemaphore, call: str) -> None:
+def test_the_token_of_a_process_that_dies_between_two_steps_comes_back(
+    one: SharedSemaphore, call: str
+) -> None:
     def dies_after(step: Callable[..., object]) -> Callable[..., object]:
         return lambda *args: (step(*args), os._exit(0))
 

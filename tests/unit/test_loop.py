@@ -152,7 +152,7 @@ def test_earlier_requests_run_before_later_events(loop: Loop, pipe: tuple[int, i
     assert seen == ["expected", "happened"]
 
 
-def test_of_many_descriptors_a_few_are_looked_at_at_a_time_and_each_gets_its_turn(
+def test_many_ready_descriptors_are_served_in_groups_and_in_turn(
     loop: Loop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(loop_module, "_EVENTS", 2)
@@ -257,7 +257,7 @@ def test_stop_waits_for_the_end_and_leaves_no_descriptor() -> None:
     loop.stop()  # the second close does nothing
 
 
-def test_one_whose_thread_could_not_be_started_can_be_stopped(
+def test_a_loop_whose_thread_could_not_be_started_can_be_stopped(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def refuse(thread: threading.Thread) -> None:
@@ -343,7 +343,9 @@ def test_dependents_learn_that_the_loop_failed() -> None:
     loop.stop()
 
 
-def test_descriptors_that_somebody_closed_are_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_closed_epoll_descriptor_ends_the_loop_with_an_error(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(loop_module, "LONGEST_POLL", 0.05)
     monkeypatch.setattr(threading, "excepthook", lambda _: None)
     loop, dependent = Loop(), Dependent()

@@ -176,7 +176,7 @@ def test_close_waits_no_longer_than_its_linger(loop: SimulatedLoop) -> None:
     assert closed[0] >= 2
 
 
-def test_both_may_close_at_once(loop: SimulatedLoop) -> None:
+def test_both_sides_of_a_link_may_close_at_once(loop: SimulatedLoop) -> None:
     cable = Cable(loop)
     closed: list[str] = []
     cable.master.close(then=lambda: closed.append("master"))

@@ -79,7 +79,7 @@ messages: st.SearchStrategy[LinkMessage] = st.one_of(
 
 
 @given(messages)
-def test_there_and_back(message: LinkMessage) -> None:
+def test_encoded_messages_decode_to_equal_ones(message: LinkMessage) -> None:
     assert decode(message.encode()) == message
 
 

@@ -282,7 +282,7 @@ class TestValues:
             meta()
 
     @pytest.mark.parametrize("thing", [3, int])
-    def test_not_a_function(self, thing: Any) -> None:
+    def test_meta_refuses_an_object_that_is_not_a_function(self, thing: Any) -> None:
         with pytest.raises(TypeError, match="is for functions"):
             meta(cpu=1)(thing)
 

@@ -315,7 +315,7 @@ async def test_a_service_that_was_changed_is_mended(world: World) -> None:
 
 
 @pytest.mark.parametrize("plural", ["services", "secrets", "endpointslices"])
-def test_an_object_of_somebody_else_is_not_touched(plural: str) -> None:
+def test_an_object_of_another_owner_is_not_touched(plural: str) -> None:
     @played()
     async def test(world: World) -> None:
         name = "es-fiber-key" if plural == "secrets" else "es-fiber"
@@ -544,7 +544,7 @@ async def test_many_pools_are_served_side_by_side(world: World) -> None:
 
 
 @played()
-async def test_why_a_pod_does_not_start_may_stand_in_its_events(world: World) -> None:
+async def test_the_status_has_the_warning_event_of_a_pod_that_does_not_start(world: World) -> None:
     world.kubelet.auto = False
     world.make_pool(replicas=1)
     await world.until(lambda: len(world.pods()) == 1)

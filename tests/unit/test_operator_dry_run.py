@@ -111,7 +111,7 @@ def test_harmless_fields_of_a_template_are_not_refused(metadata: Body) -> None:
     assert "status" not in body
 
 
-def test_annotations_that_are_none_are_left_to_the_api_server() -> None:
+def test_invalid_annotations_are_left_to_the_api_server() -> None:
     pool = make_pool(template=template(metadata={"annotations": "x"}))
     assert pod(pool, "es-0000000001", "10.96.1.2:7070")["metadata"]["annotations"] == "x"
 

@@ -226,7 +226,7 @@ def test_failing_at_once_takes_the_proof_back_until_ready_lasts() -> None:
     assert count(found.failures, again, now=NOW + 32).proven == "new"
 
 
-def test_a_wait_that_the_policy_does_not_know_is_none() -> None:
+def test_a_delay_that_the_policy_does_not_allow_is_dropped() -> None:
     found = count(failing(next_create_time=NOW + 9999)).failures
     assert (found.next_create_time, found.waiting) == (None, 0)
     found = count(failing(consecutive=4)).failures

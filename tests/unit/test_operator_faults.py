@@ -145,7 +145,7 @@ async def test_a_server_that_is_busy_is_left_alone(world: World) -> None:
         '{"apiVersion": "v1", "items": [], "metadata": {}}',
     ],
 )
-def test_a_list_that_is_none_makes_no_pods(text: str) -> None:
+def test_an_invalid_list_of_pods_creates_no_pods(text: str) -> None:
     @played
     async def test(world: World) -> None:
         world.make_pool(replicas=5)

@@ -362,7 +362,7 @@ def test_the_thread_tells_the_loop_that_made_it_and_ends_with_it() -> None:
     asyncio.run(main())
 
 
-def test_a_fault_of_ours_holds_up_no_other_event() -> None:
+def test_a_bug_in_a_handler_does_not_stop_other_events() -> None:
     """Lose the first of two events that come together."""
 
     async def main() -> None:

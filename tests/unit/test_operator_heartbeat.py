@@ -49,7 +49,7 @@ def test_an_operator_of_some_namespaces_shows_it_in_each() -> None:
 
 
 @played
-async def test_one_that_died_is_not_taken_for_a_living_one(world: World) -> None:
+async def test_the_heartbeat_of_a_killed_operator_expires(world: World) -> None:
     await world.until(lambda: is_fresh(world))
     await world.kill()
     await world.settled(names.SERVING_SECONDS + 1)
@@ -70,7 +70,7 @@ def test_a_restart_is_not_seen(graceful: bool) -> None:
     virtual_time.run(test())
 
 
-def test_one_that_cannot_list_pools_does_not_show_that_it_serves() -> None:
+def test_an_operator_that_cannot_list_pools_writes_no_heartbeat() -> None:
     async def test() -> None:
         async with a_world(operator=False) as world:
             refused = Fault("list", "fiberpools", 403, "Forbidden", times=float("inf"))
@@ -85,7 +85,7 @@ def test_one_that_cannot_list_pools_does_not_show_that_it_serves() -> None:
 
 
 @played
-async def test_one_that_waits_for_another_does_not_show_that_it_serves(world: World) -> None:
+async def test_an_operator_that_is_not_the_leader_writes_no_heartbeat(world: World) -> None:
     await world.until(lambda: is_fresh(world))
     second = world.another(
         host="127.0.0.1", port=0, identity="operator-2", namespace="fiber-system"
@@ -98,7 +98,9 @@ async def test_one_that_waits_for_another_does_not_show_that_it_serves(world: Wo
     await waiting
 
 
-def test_a_missing_right_is_said_once_and_harms_no_pool(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_missing_right_to_the_heartbeat_is_logged_once_and_harms_no_pool(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     async def test() -> None:
         async with a_world(operator=False) as world:
             refused = Fault(

@@ -452,7 +452,7 @@ def test_a_watch_that_fails_each_time_is_reported_and_paused(fault: Fault) -> No
 
 
 @played()
-async def test_one_failure_of_a_watch_does_not_hide_the_pods(site: Site) -> None:
+async def test_a_single_failure_of_a_watch_does_not_hide_the_pods(site: Site) -> None:
     site.make("a")
     await site.names()
     site.api.faults.append(Fault("watch", status=500))

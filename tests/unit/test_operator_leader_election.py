@@ -119,7 +119,7 @@ async def test_no_operator_acts_before_the_election(found: Operators) -> None:
 
 
 @played
-async def test_the_second_one_waits_for_ever(found: Operators) -> None:
+async def test_a_second_operator_waits_while_the_leader_renews(found: Operators) -> None:
     first = found.start("a")
     await until(lambda: first.is_leader)
     second = found.start("b")
@@ -222,7 +222,7 @@ async def test_a_lease_that_another_took_is_lost_at_once(found: Operators) -> No
 
 @pytest.mark.parametrize("times", [1, 2])
 @pytest.mark.parametrize("way", [{}, {"status": 500}], ids=str)
-def test_a_renewal_whose_answer_is_lost_is_still_ours(way: Body, times: int) -> None:
+def test_a_leader_whose_renewal_loses_its_answer_stays_the_leader(way: Body, times: int) -> None:
     @played
     async def test(found: Operators) -> None:
         elector = found.start("a")
@@ -270,7 +270,7 @@ def test_a_lease_without_a_holder_is_taken(spec: Body | None) -> None:
 
 
 @pytest.mark.parametrize("duration", [None, "long", 0, -3])
-def test_a_holder_that_says_no_duration_is_given_ours(duration: object) -> None:
+def test_a_lease_with_an_invalid_duration_gets_this_operators_duration(duration: object) -> None:
     @played
     async def test(found: Operators) -> None:
         spec = {"holderIdentity": "other", "leaseDurationSeconds": duration}

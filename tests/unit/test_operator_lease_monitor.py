@@ -109,7 +109,7 @@ def played(test: Callable[[Watch], Coroutine[Any, Any, None]]) -> Callable[[], N
 
 
 @played
-async def test_one_that_renews_is_alive(watch: Watch) -> None:
+async def test_a_master_that_renews_is_alive(watch: Watch) -> None:
     watch.renew()
     await asyncio.sleep(1)
     assert watch.alive() is None
@@ -174,7 +174,7 @@ async def test_a_lease_that_comes_soon_after_its_pool_is_not_missed(watch: Watch
 
 
 @played
-async def test_one_that_stops_is_lost_after_the_duration(watch: Watch) -> None:
+async def test_a_master_that_stops_renewing_is_lost_after_the_duration(watch: Watch) -> None:
     watch.renew()
     watch.monitor.follow(ES, LEASE)
     await asyncio.sleep(41)
@@ -187,7 +187,7 @@ async def test_one_that_stops_is_lost_after_the_duration(watch: Watch) -> None:
 
 
 @played
-async def test_one_that_comes_back_is_alive_again(watch: Watch) -> None:
+async def test_a_master_that_renews_again_is_alive_again(watch: Watch) -> None:
     watch.renew()
     watch.monitor.follow(ES, LEASE)
     await asyncio.sleep(21)

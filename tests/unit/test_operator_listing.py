@@ -56,7 +56,7 @@ def test_the_last_part_has_no_more() -> None:
 
 @pytest.mark.slow
 @given(OBJECTS, st.integers(min_value=0))
-def test_half_an_answer_is_none(items: Any, length: int) -> None:
+def test_a_partial_list_raises_unavailable(items: Any, length: int) -> None:
     data = json.dumps(a_list(items)).encode()
     with pytest.raises(Unavailable):
         read(data[: length % len(data)])
@@ -97,7 +97,7 @@ def test_an_empty_list_of_metadata_has_null_for_its_items() -> None:
     assert read(json.dumps(document).encode()) == ([], "")
 
 
-def test_one_object_at_a_time_is_in_memory() -> None:
+def test_a_list_is_decoded_with_one_object_in_memory() -> None:
     item = json.dumps({"large": "\N{GRINNING FACE}" + "x" * 500_000}, ensure_ascii=False).encode()
     count = 40
 

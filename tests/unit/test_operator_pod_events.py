@@ -76,7 +76,7 @@ def test_a_warning_that_something_newer_follows_is_over(reason: str) -> None:
     assert warning_of(event(("Normal", reason), 1), event(MOUNT, 2)) == "FailedMount: failedmount"
 
 
-def test_of_one_second_the_event_that_was_written_last_is_the_newest() -> None:
+def test_the_last_written_event_of_one_second_is_the_newest() -> None:
     pulling = ("Normal", "Pulling")
     assert warning_of(event(MOUNT), event(pulling)) == ""
     assert warning_of(event(pulling), event(MOUNT)) != ""

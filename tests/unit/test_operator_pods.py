@@ -205,7 +205,7 @@ def test_deletion_cost_is_kubernetes_annotation() -> None:
 
 
 @pytest.mark.parametrize("code", [None, "1", True, 2**31, 1.0])
-def test_an_end_without_an_exit_code_is_none(code: Any) -> None:
+def test_an_end_with_an_invalid_exit_code_is_ignored(code: Any) -> None:
     document = running()
     end = {"terminated": {"exitCode": code, "reason": "Error"}}
     document["status"]["containerStatuses"][0]["state"] = end

@@ -273,7 +273,7 @@ def test_a_template_may_ask_for_root(said: Json) -> None:
     assert "capabilities" not in body["containers"][0]["securityContext"]
 
 
-def test_one_container_may_be_root() -> None:
+def test_a_container_that_asks_for_root_keeps_it() -> None:
     worker = worker_of({"securityContext": {"runAsUser": 0}})
     assert worker["securityContext"]["runAsNonRoot"] is False
     assert "capabilities" not in worker["securityContext"]

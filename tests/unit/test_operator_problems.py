@@ -217,7 +217,7 @@ def test_workers_that_exit_with_0_repeatedly_cause_one_warning_with_advice() -> 
     assert status_of(pool, running(3, age=-900), now=now + 970).problems == ()
 
 
-def test_of_a_failure_and_an_end_in_one_wave_the_failure_is_reported() -> None:
+def test_a_failure_is_reported_before_a_completion_in_the_same_wave() -> None:
     pods = ended(1, ago=5), ended(2, code=0, ran=100)
     first = status_of(POOL, *pods)
     (found,) = first.problems

@@ -424,7 +424,7 @@ def test_a_template_that_fails_comes_to_an_end(replicas: int, limit: int) -> Non
 @pytest.mark.slow
 @settings(max_examples=20, deadline=None)
 @given(replicas=st.integers(1, 12))
-def test_workers_that_end_well_for_ever_come_back_ever_more_slowly(replicas: int) -> None:
+def test_workers_that_always_complete_are_replaced_at_growing_delays(replicas: int) -> None:
     model = Model(pool_document(replicas=replicas, master=MASTER), completes=True)
     for _ in range(300):
         model.act()

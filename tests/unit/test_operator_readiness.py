@@ -76,7 +76,7 @@ def test_a_pod_of_a_master_waits_for_its_agents_link(command: list[str] | None) 
     ],
     ids=["no-master", "no-agent", "own-probe", "own-credentials"],
 )
-def test_a_pod_that_waits_on_purpose_or_is_none_of_ours_has_no_such_probe(
+def test_a_pod_without_a_master_or_agent_has_no_startup_probe(
     container: Json, master: Json | None
 ) -> None:
     assert not is_probed(worker_of(container, master))

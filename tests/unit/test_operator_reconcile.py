@@ -80,7 +80,7 @@ def names(*numbers: int) -> list[str]:
         ({"replicas": 9, "suspend": True}, 0),
     ],
 )
-def test_as_many_are_created_as_are_wanted_between_the_bounds(spec: Json, wanted: int) -> None:
+def test_the_wanted_number_of_pods_within_the_bounds_is_created(spec: Json, wanted: int) -> None:
     assert plan_of(tried(**spec)).create == wanted
 
 
@@ -291,7 +291,7 @@ def test_a_disrupted_worker_is_replaced_at_once_and_not_counted() -> None:
     assert "low on memory" in event.message
 
 
-def test_a_worker_that_somebody_deletes_is_replaced_at_once_and_not_counted() -> None:
+def test_a_worker_that_a_user_deletes_is_replaced_at_once_and_not_counted() -> None:
     pool = tried(replicas=2)
     made = plan_of(pool, terminating(running(1)), running(2))
     assert made.create == 1

@@ -66,7 +66,7 @@ async def test_an_operator_at_work_is_alive_and_ready(world: World) -> None:
 
 
 @played
-async def test_one_that_waits_for_the_lease_is_alive_and_not_ready(world: World) -> None:
+async def test_an_operator_that_is_not_the_leader_is_alive_and_not_ready(world: World) -> None:
     await world.settled()
     spec = {"holderIdentity": "another", "leaseDurationSeconds": 1000}
     world.store.merge("leases", "fiber-system", OWN_LEASE, {"spec": spec})

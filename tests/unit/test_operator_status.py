@@ -196,7 +196,7 @@ def test_a_damaged_status_is_written_anew() -> None:
     assert made.status["failures"]["total"] == 0
 
 
-def test_a_value_that_ended_is_none_in_the_patch() -> None:
+def test_the_patch_of_a_status_removes_old_values() -> None:
     pool = make_pool(replicas=1)
     pool = with_plan(pool, plan_of(pool, ended(1)))
     assert pool.status.failures.next_create_time

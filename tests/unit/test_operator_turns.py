@@ -10,7 +10,7 @@ from fiber_operator.lease_monitor import in_turn
 from fiber_operator.workqueue import Key
 
 
-def test_one_namespace_does_not_make_another_wait_for_all_its_calls() -> None:
+def test_a_namespace_does_not_wait_for_all_calls_of_another() -> None:
     begun: list[str] = []
 
     async def call(turns: NamespaceSemaphore, namespace: str) -> None:

@@ -388,7 +388,7 @@ async def test_draining_waits_for_turns_and_begins_none(
 
 
 @played()
-async def test_draining_does_not_wait_for_ever(queue: WorkQueue, reconciler: Reconciler) -> None:
+async def test_draining_ends_after_its_grace(queue: WorkQueue, reconciler: Reconciler) -> None:
     reconciler.lasts = 1000.0
     queue.add(A)
     await asyncio.sleep(1)

@@ -278,7 +278,7 @@ def test_sending_to_a_peer_that_left_messages_unread_is_a_broken_pipe(pair: Pair
 
 
 @pytest.mark.parametrize("junk", [b"\x01", b"\x07" + bytes(40), b"\x01" + bytes(3)])
-def test_junk_raises_and_leaves_no_buffer_lent(pair: Pair, junk: bytes) -> None:
+def test_junk_raises_and_its_buffer_is_reused(pair: Pair, junk: bytes) -> None:
     one, other = pair
     one.send(junk)
     free = len(packet._buffers.free)
@@ -314,7 +314,7 @@ def test_a_buffer_that_can_change_is_kept_as_a_copy() -> None:
 
 
 @pytest.mark.parametrize("size", [0, 1, packet.OUT_OF_BAND_MIN, 5_000_000])
-def test_a_copy_that_other_threads_can_run_beside_is_one(size: int) -> None:
+def test_a_copy_without_the_interpreter_lock_is_equal_to_its_source(size: int) -> None:
     source = bytearray(os.urandom(size))
     made = memory_files.copy_bytes(memoryview(source).toreadonly())
     assert type(made) is bytes

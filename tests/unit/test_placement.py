@@ -40,7 +40,7 @@ def test_children_wait_in_order_until_an_agent_has_room() -> None:
     assert placement.place() == ("second", "a")
 
 
-def test_one_that_waits_no_longer_gets_no_agent() -> None:
+def test_a_child_that_left_the_queue_gets_no_agent() -> None:
     placement = with_agents()
     put(placement, "first", "second")
     assert placement.leave("first")
@@ -101,7 +101,7 @@ def test_a_silent_agent_gets_no_child_until_it_answers() -> None:
     assert placement.children == 0
 
 
-def test_one_that_is_heard_again_gets_none_while_there_is_another_reason() -> None:
+def test_an_agent_that_was_withheld_for_two_reasons_gets_no_child_until_both_end() -> None:
     placement = with_agents("a", slots=2)
     placement.withhold("a", "ending")
     placement.withhold("a", "silent")
@@ -157,7 +157,7 @@ def demand(placement: Placement[str, str], maximum: int = 1000) -> Demand:
     return Demand(placement, maximum=maximum, idle_timeout=IDLE)
 
 
-def test_as_many_are_wanted_as_children_wait_for_at_once() -> None:
+def test_the_demand_has_room_for_all_waiting_children() -> None:
     placement = with_agents(slots=8)
     wanted = demand(placement)
     assert wanted.decide(now=0).agents == 0
@@ -182,7 +182,7 @@ def test_an_idle_agent_is_released_by_name_after_its_time_and_gets_no_child_any_
     assert wanted.decide(now=IDLE).agents == 2
 
 
-def test_one_that_is_at_work_is_never_released() -> None:
+def test_an_agent_with_a_child_is_not_released() -> None:
     placement = with_agents("a", slots=1)
     put(placement, "child")
     wish = demand(placement).decide(now=1e9)
@@ -212,7 +212,7 @@ def test_agents_that_have_not_joined_are_given_up_after_a_time_without_waiting_c
     assert wanted.decide(now=1 + LINGER).agents == 0
 
 
-def test_those_that_somebody_else_wants_stay_and_are_not_asked_for() -> None:
+def test_agents_of_the_floor_stay_and_are_not_part_of_the_demand() -> None:
     placement = with_agents("a", "b", slots=1)
     wanted = Demand(placement, floor=1, maximum=9, idle_timeout=IDLE)
     wish = wanted.decide(now=1e9)
@@ -224,7 +224,7 @@ def test_those_that_somebody_else_wants_stay_and_are_not_asked_for() -> None:
     assert wanted.decide(now=4e9).release == ["b"]
 
 
-def test_one_that_retires_ends_its_work_and_goes_at_once() -> None:
+def test_a_retired_agent_is_released_when_its_child_has_ended() -> None:
     placement = with_agents("a", slots=2)
     wanted = Demand(placement, floor=1, maximum=9, idle_timeout=IDLE)
     assert put(placement, "child") == ["a"]

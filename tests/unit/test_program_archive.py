@@ -212,7 +212,7 @@ def test_secrets_are_left_out_and_named(folder: Path) -> None:
     assert names(folder) == {"main.py", "data/weights.npy"}
 
 
-def test_secrets_that_somebody_asks_for_by_name_are_sent(folder: Path) -> None:
+def test_secrets_that_fiberignore_includes_by_name_are_sent(folder: Path) -> None:
     for name in (".env", "data/.env", "a.pem", "b.pem"):
         (folder / name).write_text("x")
     (folder / ".kube").mkdir()

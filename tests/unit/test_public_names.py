@@ -39,7 +39,7 @@ def test_dir_shows_exactly_the_existing_names() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(fiber._SUBMODULES))
-def test_submodules_are_attributes_before_anybody_imports_them(name: str) -> None:
+def test_submodules_are_attributes_before_their_first_import(name: str) -> None:
     statement = f"import fiber; print(fiber.{name}.__name__)"
     done = subprocess.run([sys.executable, "-c", statement], capture_output=True, text=True)
     assert done.stdout == f"fiber.{name}\n", done.stderr

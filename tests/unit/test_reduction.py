@@ -76,7 +76,7 @@ def test_reducers_registered_with_multiprocessing_count(monkeypatch: pytest.Monk
     assert pickle.loads(reduction.dumps(lambda: closure))() == 7
 
 
-def test_encode_puts_large_buffers_beside_the_pickle() -> None:
+def test_encode_keeps_large_buffers_out_of_the_pickle() -> None:
     import numpy
 
     array = numpy.arange(100_000)

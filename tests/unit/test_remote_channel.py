@@ -134,7 +134,7 @@ def test_a_call_that_the_worker_did_not_get_is_reported_as_unread(far: Far) -> N
     assert far.observer.report.unread == (7,)
 
 
-def test_of_more_than_is_remembered_all_that_is_remembered_is_named_unread(
+def test_the_remembered_packets_of_a_lost_child_are_named_as_unread(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(remote, "_REMEMBERED", 4)

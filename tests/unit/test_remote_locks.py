@@ -57,7 +57,7 @@ def on_thread(action: Callable[[], Any]) -> Any:
     return results[0]
 
 
-def test_one_host_at_a_time(here: Any, far: Far) -> None:
+def test_a_lock_of_two_hosts_has_one_holder_at_a_time(here: Any, far: Far) -> None:
     there = far(here)
     assert isinstance(there._semlock, RemoteSemaphore)
     with there as acquired:
@@ -123,7 +123,7 @@ def test_signals_that_are_consumed_elsewhere_keep_no_stream(far: Far) -> None:
     assert len(there._semlock._streams) == 1
 
 
-def test_it_goes_on_to_other_processes(here: Any, far: Far, hosts: Hosts) -> None:
+def test_a_remote_lock_can_be_pickled_again(here: Any, far: Far, hosts: Hosts) -> None:
     there = far(here)
     data, home = pickle.dumps(there), pickle.dumps(there)
     again = pickle.loads(data)

@@ -161,7 +161,7 @@ def test_a_replica_stays_usable_after_its_home_is_lost(
     assert other[0] == 8
 
 
-def test_a_link_that_is_lost_while_somebody_waits(hosts: Hosts) -> None:
+def test_the_loss_of_a_link_ends_the_wait_for_a_replica(hosts: Hosts) -> None:
     up, _ = hosts.link("b", "a")
     with hosts.at("a"):
         data = pickle.dumps(fiber.RawArray("i", 1))

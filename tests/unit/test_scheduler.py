@@ -83,7 +83,7 @@ def test_tasks_are_assigned_as_soon_as_they_come() -> None:
     assert job.finished
 
 
-def test_it_grows_with_the_work_up_to_its_maximum() -> None:
+def test_a_pool_grows_with_its_work_up_to_its_maximum() -> None:
     scheduler, _ = pool(1, 3)
     job_of(scheduler, 100)
     decisions = scheduler.decide(0.0)
@@ -268,7 +268,7 @@ def test_a_worker_is_leased_while_it_is_not_needed() -> None:
     assert not scheduler.needs_leased()
 
 
-def test_no_worker_is_lent_that_has_something_to_do_or_could_have() -> None:
+def test_a_worker_with_possible_work_is_not_leased() -> None:
     scheduler, members = pool(1)
     job_of(scheduler, 2)
     assert not scheduler.lease(members[0].ready), "something waits"

@@ -104,7 +104,7 @@ def test_a_repeated_or_early_message_does_not_open() -> None:
         opener.open(third)
 
 
-def test_both_sides_derive_the_same_and_each_direction_has_its_own() -> None:
+def test_both_sides_derive_the_same_keys_and_each_direction_has_another() -> None:
     agent, master = os.urandom(32), os.urandom(32)
     up, down = derive(agent, master, for_master=False)
     assert (down, up) == derive(agent, master, for_master=True)

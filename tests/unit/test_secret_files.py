@@ -107,7 +107,7 @@ def test_names_of_secrets(tmp_path: Path, name: str) -> None:
         "#",
     ],
 )
-def test_names_that_are_none(tmp_path: Path, name: str) -> None:
+def test_names_of_files_that_are_not_secret(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_text("x")
     assert found(tmp_path / name) is None
 
@@ -120,7 +120,7 @@ def test_folders_of_secrets(name: str) -> None:
 @pytest.mark.parametrize(
     "name", ["aws", "envs", "environments", "gcloud", "gh", "secrets", ".github"]
 )
-def test_folders_that_are_none(name: str) -> None:
+def test_folders_that_are_not_secret(name: str) -> None:
     assert program_files.secret_in_folder(name) is None
 
 
@@ -177,7 +177,7 @@ def test_contents_of_secrets(tmp_path: Path, name: str) -> None:
         CERTIFICATE,
     ],
 )
-def test_contents_that_are_none(tmp_path: Path, text: str) -> None:
+def test_contents_that_are_not_secret(tmp_path: Path, text: str) -> None:
     (tmp_path / "notes.txt").write_text(text)
     assert found(tmp_path / "notes.txt") is None
 

@@ -15,7 +15,7 @@ ROWS = [line for line in PAGE.splitlines() if line.startswith("| ")]
 
 
 @pytest.mark.parametrize(("file", "test"), sorted(set(NAMED)))
-def test_it_exists(file: str, test: str) -> None:
+def test_a_test_that_the_security_page_names_exists(file: str, test: str) -> None:
     module = ast.parse((ROOT / file).read_text(encoding="utf-8"))
     functions = ast.FunctionDef | ast.AsyncFunctionDef
     assert test in {node.name for node in ast.walk(module) if isinstance(node, functions)}

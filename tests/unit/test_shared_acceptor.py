@@ -37,7 +37,7 @@ def test_each_agent_comes_to_the_pool_whose_key_it_has(
     assert [len(master.links) for master in masters] == [1, 1]
 
 
-def test_the_key_of_no_pool_is_refused_and_one_pool_hears_of_it(
+def test_an_unknown_key_is_refused_and_reported_to_one_pool(
     site: Site, acceptor: Acceptor, pools: list[MasterCredentials]
 ) -> None:
     masters = [site.listener(acceptor, credentials=pool)[1] for pool in pools]

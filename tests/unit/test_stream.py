@@ -192,7 +192,7 @@ def meet(one: LinkProtocol, other: LinkProtocol, now: float) -> None:
         one.received(datagram, now)
 
 
-def test_both_speak_at_once_so_that_each_knows_that_the_connection_works() -> None:
+def test_a_new_connection_sends_a_datagram_without_a_message() -> None:
     one, other = LinkProtocol(0), LinkProtocol(0)
     one.connected(0)
     other.connected(0)

@@ -107,7 +107,9 @@ def test_no_more_frames_than_slots_are_put_together_at_a_time(
     assert together <= SLOTS
 
 
-def test_it_says_when_a_frame_has_left(ends: tuple[LinkProtocol, LinkProtocol]) -> None:
+def test_on_left_is_called_in_the_order_in_which_frames_leave(
+    ends: tuple[LinkProtocol, LinkProtocol],
+) -> None:
     sender, receiver = ends
     left: list[str] = []
     sender.send(filled(1, LARGE), lane="one", on_left=lambda: left.append("large"))

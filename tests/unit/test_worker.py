@@ -281,7 +281,7 @@ def test_each_task_is_noted_before_it_runs(rig: Rig) -> None:
     assert seen == [(seq, 0), (seq, 1), (seq, 2), (seq, 3)]
 
 
-def test_of_short_tasks_each_few_are_noted(rig: Rig) -> None:
+def test_the_position_among_short_tasks_is_noted_once_a_stride(rig: Rig) -> None:
     seen: list[int] = []
     tasks.state["note"] = lambda: seen.append(rig.progress[1])
     try:

@@ -97,7 +97,7 @@ def test_counts(workers: PoolWorkerSet) -> None:
     assert workers.failures == 0, "who was told to go, or was ready, did not fail to start"
 
 
-def test_as_many_as_are_missing_are_started_at_once(workers: PoolWorkerSet) -> None:
+def test_all_missing_workers_are_started_at_once(workers: PoolWorkerSet) -> None:
     assert workers.startable(4, 0.0) == 4
     assert workers.next_try() is None
 
@@ -108,7 +108,7 @@ def test_as_many_as_are_missing_are_started_at_once(workers: PoolWorkerSet) -> N
 @pytest.mark.parametrize(
     ("failure", "patience"), [(RAISED, RAISED_PATIENCE), (KILLED, KILLED_PATIENCE)]
 )
-def test_it_gives_up_when_none_has_started_for_long(
+def test_a_pool_gives_up_when_no_worker_starts_in_time(
     workers: PoolWorkerSet, failure: StartFailure, patience: float
 ) -> None:
     last = fail_until(workers, patience + LAST_PAUSE, failure)
@@ -143,7 +143,9 @@ def test_a_killed_worker_does_not_end_a_pool_whose_workers_raised_before(
     assert workers.error is None
 
 
-def test_one_that_raises_after_some_that_were_killed_has_its_tries(workers: PoolWorkerSet) -> None:
+def test_a_worker_that_raises_after_killed_ones_has_the_tries_of_its_kind(
+    workers: PoolWorkerSet,
+) -> None:
     fail_until(workers, KILLED_PATIENCE / 2, KILLED)
     fail(workers, KILLED_PATIENCE / 2, RAISED)
     assert workers.error is None, "it may be the first of its kind"
@@ -176,7 +178,7 @@ def test_workers_of_lost_hosts_do_not_count_as_failures(workers: PoolWorkerSet) 
     assert (workers.failures, workers.error, workers.next_try()) == (0, None, None)
 
 
-def test_one_that_starts_clears_the_others(workers: PoolWorkerSet) -> None:
+def test_a_worker_that_starts_clears_the_failures_of_others(workers: PoolWorkerSet) -> None:
     fail_until(workers, RAISED_PATIENCE / 2, RAISED)
     member = start(workers, ready=True)
     assert (workers.failures, workers.next_try()) == (0, None)
