@@ -21,7 +21,7 @@ from fiber._hub.client import HubStream
 from fiber._hub.handles import GrantSet, collecting_grants
 from fiber._hub.local import LocalChannel
 from fiber._hub.protocol import Op
-from fiber._hub.queue_delivery import arrive
+from fiber._hub.queue_delivery import become_reader
 from fiber._wire import packet, work
 from fiber.connection import Connection
 from hosts import Hosts, Wire, background
@@ -199,7 +199,7 @@ def test_a_reader_says_that_it_has_its_channel_after_that_is_attached(
     arrivals, door = LocalChannel.pair()
     wire.hold()
     arrived: list[Any] = []
-    thread = background(lambda: arrived.append(arrive(door)))
+    thread = background(lambda: arrived.append(become_reader(door)))
     answer: Any = packet.loads(arrivals.recv())
     answer.send(invitation)
     assert wait_until(lambda: answer.poll(0) or is_confirming(), PATIENCE)
