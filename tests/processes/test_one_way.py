@@ -269,7 +269,7 @@ def test_so_does_the_dealer_of_a_queue() -> None:
     inbox, outbox = local.one_way_pair()
     arrivals, door = LocalChannel.pair()
     Dealer(inbox, arrivals).start()
-    reader = queue_delivery.arrive(door)
+    reader = queue_delivery.become_reader(door)
     outbox.send(b"first")
     assert reader.recv().tobytes() == b"first"  # it sleeps before it looks again
     outbox.backlog.put(memoryview(b"unannounced"))
