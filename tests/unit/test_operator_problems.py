@@ -1,4 +1,4 @@
-"""Problems as a person reads them: what, why, what to do."""
+"""Problems in the status: what happened, why, and what to do."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 
 from fiber_api.names import Reason
-from fiber_api.v1alpha1 import FiberPool, FiberPoolStatus, Problem
-from fiber_operator.planning import messages, plans
+from fiber_api.v1alpha1 import FiberPool, FiberPoolStatus
+from fiber_operator.planning import messages
 from fiber_operator.planning.manifests import spec_hash, template_hash
-from fiber_operator.planning.plans import Obstacle, PodRefusal
+from fiber_operator.planning.plans import LeaseVerdict, Obstacle, PodRefusal
 from unit.operator_objects import (
     MASTER,
     NOW,
@@ -24,192 +24,324 @@ from unit.operator_objects import (
     status_of,
     unschedulable,
     waiting,
+    with_plan,
 )
 
 Json = dict[str, Any]
-
-
-def problem(pool: FiberPool, *pods: Json, **more: Any) -> Problem:
-    """The only problem."""
-    (found,) = status_of(pool, *pods, **more).problems
-    return found
-
-
-def then(pool: FiberPool, status: FiberPoolStatus) -> FiberPool:
-    return pool.model_copy(update={"status": status})
-
-
 POOL = make_pool(replicas=1)
+TWO = make_pool(replicas=2)
+LEASED = {**MASTER, "leaseName": "es"}
+EXPIRED, MISSING = LeaseVerdict(alive=False), LeaseVerdict(missing=True)
 
 
-def test_a_pool_without_problems_says_so() -> None:
-    status = status_of(POOL, running(1))
-    assert status.problems == ()
-    assert status.phase == "Ready"
+def after(pool: FiberPool, *pods: Json, **more: Any) -> FiberPool:
+    """Return the pool with the status that the operator wrote for these pods."""
+    return with_plan(pool, plan_of(pool, *pods, **more))
 
 
-# -- Pods that do not start
+def counted(**failures: Any) -> FiberPool:
+    """Return the pool with these failures in its status."""
+    known = {"failures": {"specHash": spec_hash(POOL), **failures}}
+    return POOL.model_copy(update={"status": FiberPoolStatus.model_validate(known)})
 
 
-@pytest.mark.parametrize(
-    ("reason", "named", "terminal"),
-    [
-        ("InvalidImageName", "InvalidImageName", True),
-        ("ErrImageNeverPull", "ErrImageNeverPull", True),
-        ("CreateContainerConfigError", "CreateContainerConfigError", False),
-        ("CreateContainerError", "CreateContainerError", False),
-        ("RunContainerError", "RunContainerError", False),
-        ("PreStartHookError", "CreateContainerError", False),
-    ],
-)
-def test_a_problem_that_waiting_does_not_mend_is_an_error_at_once(
-    reason: str, named: str, terminal: bool
-) -> None:
-    found = problem(POOL, waiting(1, reason, 'secret "token" not found.'))
-    assert (found.reason, found.severity, found.terminal) == (named, "Error", terminal)
-    assert found.pod == name_of(1)
-    assert f'{reason}: secret "token" not found. ' in found.message
-    assert "spec.template" in found.message
+def refused(code: int, message: str, *more: Any) -> PodRefusal:
+    return PodRefusal(template_hash(POOL), code, message, NOW, *more)
 
 
-def test_an_image_that_would_run_as_root_is_reported_with_the_remedy() -> None:
-    kubelet = "container has runAsNonRoot and image will run as root"
-    found = problem(POOL, waiting(1, "CreateContainerConfigError", kubelet))
-    assert found.terminal
-    assert "runAsUser" in found.message
+def row(name: str, problem: str, *pods: Json, pool: FiberPool = POOL, **seen: Any) -> Any:
+    """Return a pool, its pods, what the operator knows, and the only problem of its status.
+
+    The problem is written as its reason, its severity, and ``terminal`` if it is.  Parts of its
+    message follow; those after ``not`` are absent.
+    """
+    return pytest.param(pool, pods, seen, problem, id=name)
 
 
-def test_an_image_that_cannot_be_pulled_is_a_warning_first() -> None:
-    pull = 'failed to pull "x": manifest unknown'
-    pods = [waiting(1, "ErrImagePull", pull), waiting(2, "ErrImagePull", pull)]
-    pool = make_pool(replicas=3)
-    first = status_of(pool, *pods)
-    (found,) = first.problems
-    assert (found.reason, found.severity, found.count) == ("ImagePullError", "Warning", 2)
-    assert not found.terminal
-    assert "manifest unknown" in found.message
-    second = status_of(then(pool, first), waiting(1, "ImagePullBackOff", "Back-off: " + pull))
-    assert second.problems[0].severity == "Error"
-    assert second.problems[0].since == found.since
-    assert second.phase == "Degraded"
-    lasting = status_of(then(pool, first), *pods, now=NOW + 30)
-    assert lasting.problems[0].severity == "Error"
-    assert status_of(then(pool, second), *pods).problems[0].severity == "Error"
+def unready(message: str) -> Json:
+    pod = running(1)
+    pod["status"]["conditions"] = [condition("Ready", "False", ago=5, message=message)]
+    return pod
 
 
-def test_the_cause_is_kept_when_the_kubelet_only_says_that_it_waits() -> None:
-    first = status_of(POOL, waiting(1, "ErrImagePull", "manifest unknown"))
-    found = problem(then(POOL, first), waiting(1, "ImagePullBackOff", 'Back-off pulling image "x"'))
-    assert "manifest unknown" in found.message
-
-
-def test_unschedulable_is_a_warning_in_the_schedulers_words_until_it_takes_too_long() -> None:
-    said = "0/2 nodes are available: 2 Insufficient nvidia.com/gpu."
-    pods = [unschedulable(1, said, age=9), unschedulable(2, said, age=8)]
-    pool = make_pool(replicas=2)
-    found = problem(pool, *pods)
-    assert (found.reason, found.severity, found.count) == ("Unschedulable", "Warning", 2)
-    assert said.rstrip(".") in found.message
-    late = problem(pool, *pods, now=NOW + 900)
-    assert (late.severity, late.terminal) == ("Error", False)
-
-
-def test_problems_that_only_events_show_are_reported() -> None:
-    mount = 'FailedMount: MountVolume.SetUp failed for volume "data": secret "token" not found'
-    pod = waiting(1, "ContainerCreating", age=8)
-    found = problem(POOL, pod, warnings={name_of(1): mount})
-    assert (found.reason, found.severity) == ("FailedMount", "Warning")
-    assert 'secret "token" not found' in found.message
-
-
-def test_a_pod_that_takes_too_long_is_an_error() -> None:
-    found = problem(POOL, waiting(1, "ContainerCreating", age=900))
-    assert (found.reason, found.severity) == ("StartupTimeout", "Error")
-    assert "900 s" in found.message
-
-
-def test_a_worker_that_ran_and_was_never_ready_is_reported_with_all_details() -> None:
+def never_ready() -> Json:
     pod = running(1, age=902, ready=False)
     pod["status"]["conditions"][0]["message"] = "containers with unready status: [worker]"
-    found = problem(POOL, pod)
-    assert (found.reason, found.severity) == ("StartupTimeout", "Error")
-    said = "did not become ready: containers with unready status: [worker]. It was deleted"
-    assert said in found.message
-    assert "kubectl describe pod" not in found.message
-    assert "kubectl logs --follow --selector fiber.dev/pool=es." in found.message
-    assert "It is not replaced before" in found.message
-    probe = "Unhealthy: Readiness probe failed: HTTP probe failed with statuscode: 503"
-    assert probe in problem(POOL, pod, warnings={name_of(1): probe}).message
+    return pod
 
 
-def test_a_worker_that_lost_its_readiness_is_a_warning() -> None:
-    pod = running(1)
-    pod["status"]["conditions"] = [condition("Ready", "False", ago=5, message="node silent")]
-    found = problem(POOL, pod)
-    assert (found.reason, found.severity) == ("NotReady", "Warning")
-    assert "node silent" in found.message
+def init_failed(container: str, reason: str, message: str) -> Json:
+    end = {"terminated": {"exitCode": 1, "reason": reason, "message": message}}
+    statuses = [{"name": container, "state": end}]
+    return pod_document(1, phase="Failed", initContainerStatuses=statuses)
 
 
-# -- Pods that fail
+def evicted(message: str) -> Json:
+    pod = ended(1, code=137)
+    pod["status"] |= {"reason": "Evicted", "message": message}
+    return pod
 
 
-def test_a_failed_worker_shows_its_exit_code_and_its_last_lines() -> None:
-    found = problem(POOL, ended(1, code=3, ran=12, message="Traceback:\nKeyError: 'x'"))
-    assert (found.reason, found.severity, found.terminal) == ("ContainerFailed", "Error", False)
-    assert f"{name_of(1)} exited with code 3 after 12 s" in found.message
-    assert found.message.endswith("Traceback:\nKeyError: 'x'")
+def limited_to(memory: str) -> FiberPool:
+    worker = {"name": "worker", "image": "i", "resources": {"limits": {"memory": memory}}}
+    return make_pool(replicas=1, template={"spec": {"containers": [worker]}})
+
+
+TOKEN = 'secret "token" not found'
+ROOT = "container has runAsNonRoot and image will run as root"
+PULL = 'failed to pull "x": manifest unknown'
+PULLS = [waiting(number, "ErrImagePull", PULL) for number in (1, 2)]
+WAITS = waiting(1, "ImagePullBackOff", 'Back-off pulling image "x"')
+PULLING = after(TWO, *PULLS)
+GPU = "0/2 nodes are available: 2 Insufficient nvidia.com/gpu"
+HOMELESS = [unschedulable(1, f"{GPU}.", age=9), unschedulable(2, f"{GPU}.", age=8)]
+MOUNT = f'FailedMount: MountVolume.SetUp failed for volume "data": {TOKEN}'
+PROBE = "Unhealthy: Readiness probe failed: HTTP probe failed with statuscode: 503"
+NO_PROGRAM = 'exec: "pyton": executable file not found in $PATH'
+DISK = 'Usage of EmptyDir volume "x" exceeds the limit "1Gi"'
+
+DO_NOT_START = [
+    *(
+        row(
+            f"waiting-{reason}",
+            f"{found}; of {name_of(1)}; {reason}: {TOKEN}. ; spec.template",
+            waiting(1, reason, f"{TOKEN}."),
+        )
+        for reason, found in [
+            ("InvalidImageName", "InvalidImageName Error terminal"),
+            ("ErrImageNeverPull", "ErrImageNeverPull Error terminal"),
+            ("CreateContainerConfigError", "CreateContainerConfigError Error"),
+            ("CreateContainerError", "CreateContainerError Error"),
+            ("RunContainerError", "RunContainerError Error"),
+            ("PreStartHookError", "CreateContainerError Error"),
+        ]
+    ),
+    row(
+        "root",
+        "CreateContainerConfigError Error terminal; runAsUser",
+        waiting(1, "CreateContainerConfigError", ROOT),
+    ),
+    row("pull", "ImagePullError Warning; 2 pods; manifest unknown", *PULLS, pool=TWO),
+    row("pull-30-s", "ImagePullError Error; manifest unknown", *PULLS, pool=PULLING, now=NOW + 30),
+    # The kubelet says that it waits.  The cause is from the status.
+    row("pull-waits", "ImagePullError Error; manifest unknown", WAITS, pool=PULLING),
+    row("pull-again", "ImagePullError Error", *PULLS, pool=after(PULLING, WAITS)),
+    row("no-node", f"Unschedulable Warning; 2 pods; {GPU}", *HOMELESS, pool=TWO),
+    row("no-node-900-s", "Unschedulable Error", *HOMELESS, pool=TWO, now=NOW + 900),
+    row(
+        "event",
+        f"FailedMount Warning; {TOKEN}",
+        waiting(1, "ContainerCreating", age=8),
+        warnings={name_of(1): MOUNT},
+    ),
+    row("silence", "StartupTimeout Error; 900 s", waiting(1, "ContainerCreating", age=900)),
+    row(
+        "never-ready",
+        "StartupTimeout Error; did not become ready: containers with unready status: [worker]. It "
+        "was deleted; kubectl logs --follow --selector fiber.dev/pool=es.; It is not replaced "
+        "before; not kubectl describe pod",
+        never_ready(),
+    ),
+    row(
+        "never-ready-by-its-probe",
+        f"StartupTimeout Error; {PROBE}",
+        never_ready(),
+        warnings={name_of(1): PROBE},
+    ),
+    row("no-longer-ready", "NotReady Warning; node silent", unready("node silent")),
+]
+
+FAIL = [
+    row(
+        "exit-code",
+        f"ContainerFailed Error; {name_of(1)} exited with code 3 after 12 s; "
+        "Traceback:\nKeyError: 'x'",
+        ended(1, code=3, ran=12, message="Traceback:\nKeyError: 'x'"),
+    ),
+    row(
+        "no-fiber",
+        f"ContainerFailed Error; The init container fiber-identity of {name_of(1)}; code 1; No "
+        "module named fiber; Install Fiber in the image",
+        init_failed("fiber-identity", "Error", "No module named fiber"),
+    ),
+    row(
+        "no-python",
+        f"RunContainerError Error; The init container fiber-identity of {name_of(1)}; no "
+        "such file; Install Fiber in the image",
+        init_failed("fiber-identity", "StartError", "no such file"),
+    ),
+    row(
+        "another-init-container",
+        "ContainerFailed Error; not fiber-identity",
+        init_failed("mine", "Error", "no data"),
+    ),
+    row("signal", "ContainerFailed Error; code 139 (SIGSEGV)", ended(1, code=139)),
+    row(
+        "memory",
+        "OOMKilled Error; 512Mi; resources.limits.memory",
+        ended(1, code=137, reason="OOMKilled"),
+        pool=limited_to("512Mi"),
+    ),
+    row(
+        "no-agent",
+        "Completed Error; python -m fiber.agent",
+        ended(1, code=0, ran=0, reason="Completed"),
+    ),
+    row(
+        "no-program",
+        f"RunContainerError Error terminal; {NO_PROGRAM}",
+        ended(1, code=128, reason="StartError", message=NO_PROGRAM),
+    ),
+    row(
+        "no-memory-to-start",
+        "RunContainerError Error",
+        ended(1, code=128, reason="StartError", message="cannot allocate memory"),
+    ),
+    row(
+        "refused-by-its-node",
+        "ContainerFailed Error; OutOfcpu; no cpu left",
+        pod_document(1, phase="Failed", reason="OutOfcpu", message="no cpu left"),
+    ),
+    row("disk", f"ContainerFailed Error; failed: Evicted: {DISK}; not last lines", evicted(DISK)),
+    row("two", "ContainerFailed Error; 2 pods", ended(1), ended(2), pool=TWO),
+    row(
+        "a-failure-and-an-end",
+        f"ContainerFailed Error; of {name_of(1)}",
+        ended(1, ago=5),
+        ended(2, code=0, ran=100),
+    ),
+    *(
+        row(
+            f"gone-{number}",
+            f"ContainerFailed Error; A worker failed{known}, and its pod is gone. See the events "
+            "of the pool with kubectl describe fiberpool es.",
+            pool=counted(waves=2, **failures),
+        )
+        for number, (known, failures) in enumerate(
+            [
+                ("", {}),
+                (" (Error)", {"lastReason": "Error"}),
+                (" (OOMKilled, exit code 137)", {"lastReason": "OOMKilled", "lastExitCode": 137}),
+            ]
+        )
+    ),
+]
+
+QUOTA = "pods is forbidden: exceeded quota: team, requested: cpu=1"
+POLICY = 'violates PodSecurity "restricted:latest"'
+INVALID = "spec.containers[0].image: Required value"
+ACCOUNT = 'pods "es-1" is forbidden: error looking up service account team/default: not found'
+NO_ACCOUNT = refused(403, ACCOUNT, 5, True)
+TAKEN = Obstacle(Reason.NAME_TAKEN, "the Service es-fiber is another's", True)
+HAD_A_LEASE = after(make_pool(replicas=1, master=LEASED), master=LeaseVerdict(alive=True))
+NO_LEASE = make_pool(replicas=1, master={**MASTER, "leaseName": "se"})
+RELEASE = {"release": [name_of(1), "es-web", "other-0000000001"]}
+
+OF_THE_POOL = [
+    row("quota", f"QuotaExceeded Error; {QUOTA}", refusal=refused(403, QUOTA)),
+    row("policy", f"Forbidden Error terminal; {POLICY}", refusal=refused(403, POLICY)),
+    row("template", f"InvalidTemplate Error terminal; {INVALID}", refusal=refused(422, INVALID)),
+    row("account", "Forbidden Warning", refusal=NO_ACCOUNT),
+    row(
+        "account-31-s",
+        "Forbidden Error",
+        pool=after(POOL, refusal=NO_ACCOUNT),
+        refusal=NO_ACCOUNT,
+        now=NOW + 31,
+    ),
+    row("name", f"NameTaken Error terminal; {TAKEN.message}", running(1), obstacles=(TAKEN,)),
+    row(
+        "lost-master",
+        "MasterLost Error; 10.0.3.7:41337; epoch 1; laptop-7:4711; onLost is Delete",
+        running(1),
+        pool=make_pool(replicas=1, master=LEASED, onLost="Delete"),
+        master=LeaseVerdict(alive=False),
+    ),
+    row(
+        "lost-lease",
+        "MasterLost Error; The Lease es did not exist for 30 s",
+        running(1),
+        pool=HAD_A_LEASE,
+        master=LeaseVerdict(alive=False, missing=True),
+    ),
+    row(
+        "no-lease",
+        "LeaseNotFound Warning; no Lease se in this namespace; 10.0.3.7:41337; correct "
+        "spec.master.lease",
+        pool=NO_LEASE,
+        master=MISSING,
+    ),
+    row(
+        "no-lease-30-s",
+        "LeaseNotFound Error",
+        running(1),
+        pool=after(NO_LEASE, master=MISSING),
+        master=MISSING,
+        now=NOW + 30,
+    ),
+    row(
+        "address-family",
+        "InvalidSpec Error terminal; fd00::7; delete the Service es-fiber",
+        running(1),
+        pool=make_pool(replicas=1, master={**MASTER, "host": "fd00::7"}),
+    ),
+    row(
+        "release",
+        "InvalidRelease Warning; 2 pods; es-web, other-0000000001",
+        running(2),
+        pool=make_pool(replicas=1, scaleDown=RELEASE),
+    ),
+]
+
+
+@pytest.mark.parametrize(("pool", "pods", "seen", "expected"), [*DO_NOT_START, *FAIL, *OF_THE_POOL])
+def test_the_status_has_one_problem(
+    pool: FiberPool, pods: list[Json], seen: Json, expected: str
+) -> None:
+    (found,) = status_of(pool, *pods, **seen).problems
+    kind, *parts = expected.split("; ")
+    assert f"{found.reason} {found.severity}{' terminal' * found.terminal}" == kind
+    text = f"{found.count} pods, of {found.pod}: {found.message}"
+    for part in parts:
+        unsaid = part.startswith("not ")
+        assert (part.removeprefix("not ") in text) is not unsaid
+
+
+TERMINATING = (
+    'pods "es-1" is forbidden: unable to create new content in namespace team because it is '
+    "being terminated"
+)
+BOTH_FAMILIES = "10.96.1.2:7070,[fd00:96::2]:7070"
 
 
 @pytest.mark.parametrize(
-    ("end", "reason", "said"),
+    ("pool", "pods", "seen"),
     [
-        ({"reason": "Error", "message": "No module named fiber"}, "ContainerFailed", "code 1"),
-        ({"reason": "StartError", "message": "no such file"}, "RunContainerError", "no such file"),
+        pytest.param(POOL, [running(1)], {}, id="ready"),
+        pytest.param(POOL, [running(1)], {"refusal": refused(403, QUOTA)}, id="full-of-its-own"),
+        pytest.param(POOL, [], {"refusal": refused(403, TERMINATING)}, id="terminating-namespace"),
+        *(
+            (make_pool(replicas=1, master={**MASTER, "host": host}), [], {"address": BOTH_FAMILIES})
+            for host in ("10.0.3.7", "fd00::7")
+        ),
     ],
 )
-def test_a_failed_init_container_is_named_with_the_advice_to_install_fiber(
-    end: Json, reason: str, said: str
-) -> None:
-    pod = pod_document(1, phase="Failed")
-    state = {"terminated": {"exitCode": 1, **end}}
-    pod["status"]["initContainerStatuses"] = [{"name": "fiber-identity", "state": state}]
-    found = problem(POOL, pod)
-    assert found.reason == reason
-    assert f"The init container fiber-identity of {name_of(1)}" in found.message
-    assert said in found.message
-    assert end["message"] in found.message
-    assert "Install Fiber in the image" in found.message
-    pod["status"]["initContainerStatuses"][0]["name"] = "mine"
-    assert "fiber-identity" not in problem(POOL, pod).message
+def test_the_status_has_no_problem(pool: FiberPool, pods: list[Json], seen: Json) -> None:
+    assert status_of(pool, *pods, **seen).problems == ()
 
 
-def test_a_signal_is_named() -> None:
-    assert "code 139 (SIGSEGV)" in problem(POOL, ended(1, code=139)).message
+# -- Problems in the course of time
 
 
-def test_out_of_memory_names_the_limit() -> None:
-    worker = {"name": "worker", "image": "i", "resources": {"limits": {"memory": "512Mi"}}}
-    pool = make_pool(replicas=1, template={"spec": {"containers": [worker]}})
-    found = problem(pool, ended(1, code=137, reason="OOMKilled"))
-    assert found.reason == "OOMKilled"
-    assert "512Mi" in found.message
-    assert "resources.limits.memory" in found.message
-
-
-def test_a_command_that_is_no_agent_is_recognized() -> None:
-    found = problem(POOL, ended(1, code=0, ran=0, reason="Completed"))
-    assert found.reason == "Completed"
-    assert "python -m fiber.agent" in found.message
-
-
-def test_workers_that_exit_with_0_repeatedly_cause_one_warning_with_advice() -> None:
+def test_workers_that_end_well_again_and_again_are_a_warning() -> None:
     pool, now = make_pool(replicas=1, master=MASTER), NOW
     for number in (1, 2):
-        pod = ended(number, code=0, age=20 + NOW - now, ran=12, ago=NOW - now)
-        status = status_of(pool, pod, now=now)
-        pool, now = then(pool, status), now + 40
-        assert bool(status.problems) is (number == 2)
-    (found,) = status.problems
+        pool = after(
+            pool, ended(number, code=0, age=20 + NOW - now, ran=12, ago=NOW - now), now=now
+        )
+        assert bool(pool.status.problems) is (number == 2)
+        now += 40
+    (found,) = pool.status.problems
     assert (found.severity, found.count, found.pod) == ("Warning", 2, name_of(2))
     for said in ("exit code 0 after 12 s", "python -m fiber.agent", "lostGraceSeconds", "before"):
         assert said in found.message
@@ -217,212 +349,54 @@ def test_workers_that_exit_with_0_repeatedly_cause_one_warning_with_advice() -> 
     assert status_of(pool, running(3, age=-900), now=now + 970).problems == ()
 
 
-def test_a_failure_is_reported_before_a_completion_in_the_same_wave() -> None:
-    pods = ended(1, ago=5), ended(2, code=0, ran=100)
-    first = status_of(POOL, *pods)
-    (found,) = first.problems
-    assert (found.reason, found.pod) == ("ContainerFailed", name_of(1))
-    assert first.failures.last_reason == "Error"
-    assert status_of(then(POOL, first), *pods) == first
-
-
-def test_a_program_that_is_not_in_the_image_is_hopeless() -> None:
-    said = 'exec: "pyton": executable file not found in $PATH'
-    found = problem(POOL, ended(1, code=128, reason="StartError", message=said))
-    assert (found.reason, found.terminal) == ("RunContainerError", True)
-    assert said in found.message
-    busy = problem(POOL, ended(1, code=128, reason="StartError", message="cannot allocate memory"))
-    assert not busy.terminal
-
-
-def test_a_pod_that_a_node_turned_away_shows_the_nodes_words() -> None:
-    found = problem(POOL, pod_document(1, phase="Failed", reason="OutOfcpu", message="no cpu left"))
-    assert "OutOfcpu" in found.message
-    assert "no cpu left" in found.message
-
-
-def test_a_worker_that_took_too_much_disk_shows_the_nodes_words() -> None:
-    evicted = ended(1, code=137)
-    said = 'Usage of EmptyDir volume "x" exceeds the limit "1Gi"'
-    evicted["status"] |= {"reason": "Evicted", "message": said}
-    found = problem(POOL, evicted)
-    assert f"failed: Evicted: {said}" in found.message
-    assert "last lines" not in found.message
-
-
 def test_failures_are_summed_up_while_they_last() -> None:
-    pool = make_pool(replicas=2)
-    first = status_of(pool, ended(1), ended(2))
-    assert first.problems[0].count == 2
-    unchanged = status_of(then(pool, first), ended(1), ended(2), now=NOW + 3)
-    assert unchanged.problems == first.problems
-    gone = status_of(then(pool, first), now=NOW + 3)
-    assert gone.problems == first.problems
-    more = status_of(then(pool, first), ended(1), ended(2), ended(3, ago=-2), now=NOW + 5)
-    assert (more.problems[0].count, more.problems[0].pod) == (3, name_of(3))
+    first = after(TWO, ended(1), ended(2))
+    for pods in ([ended(1), ended(2)], []):
+        assert status_of(first, *pods, now=NOW + 3).problems == first.status.problems
+    (more,) = status_of(first, ended(1), ended(2), ended(3, ago=-2), now=NOW + 5).problems
+    assert (more.count, more.pod) == (3, name_of(3))
+    pods = ended(1, ago=5), ended(2, code=0, ran=100)
+    mixed = after(POOL, *pods)
+    assert mixed.status.failures.last_reason == "Error"
+    assert status_of(mixed, *pods) == mixed.status
 
 
-@pytest.mark.parametrize(
-    ("known", "said"),
-    [
-        ({}, "A worker failed, and its pod is gone."),
-        ({"lastReason": "Error"}, "A worker failed (Error), and its pod is gone."),
-        (
-            {"lastReason": "OOMKilled", "lastExitCode": 137},
-            "A worker failed (OOMKilled, exit code 137), and its pod is gone.",
-        ),
-    ],
-)
-def test_the_message_of_a_failure_has_the_known_fields(known: Json, said: str) -> None:
-    edited = {"failures": {"waves": 2, "specHash": spec_hash(POOL), **known}}
-    found = problem(then(POOL, FiberPoolStatus.model_validate(edited)))
-    assert found.reason == "ContainerFailed"
-    assert found.message == f"{said} See the events of the pool with kubectl describe fiberpool es."
+def test_a_problem_keeps_its_time_and_none_is_in_the_future() -> None:
+    pod = waiting(1, "ErrImagePull", "no such image")
+    pool = after(POOL, pod)
+    (told,) = pool.status.problems
+    assert status_of(pool, WAITS, now=NOW + 2).problems[0].since == told.since
+    (ready,) = (c for c in pool.status.conditions if c.type == "Ready")
+    future = NOW + 10**9
+    edited = {
+        "problems": (told.model_copy(update={"since": future}),),
+        "conditions": (ready.model_copy(update={"last_transition_time": future}),),
+    }
+    pool = pool.model_copy(update={"status": pool.status.model_copy(update=edited)})
+    pool = after(pool, pod, now=NOW + 5)
+    assert pool.status.problems[0].since == NOW + 5
+    assert {c.last_transition_time for c in pool.status.conditions} == {NOW + 5}
+    third = status_of(pool, pod, now=NOW + 35)
+    assert third.problems[0].severity == "Error", "it was a warning for half a minute"
 
 
-def test_a_wait_that_is_not_waited_for_is_not_shown() -> None:
-    far = {"waves": 1, "specHash": spec_hash(POOL), "nextCreateTime": "2099-01-01T00:00:00Z"}
-    pool = then(POOL, FiberPoolStatus.model_validate({"failures": far}))
+def test_a_wait_that_is_too_long_is_not_shown() -> None:
+    pool = counted(waves=1, nextCreateTime="2099-01-01T00:00:00Z")
     status = status_of(pool, ended(1))
     assert status.failures.next_create_time is None or status.failures.next_create_time < NOW + 999
     assert "2099" not in str(status.model_dump(mode="json"))
     assert status_of(pool).failures.next_create_time is None
 
 
-def test_a_problem_is_not_there_since_a_time_that_has_not_come() -> None:
-    first = status_of(POOL, waiting(1, "ErrImagePull", "no such image"))
-    (told,) = first.problems
-    (ready,) = (c for c in first.conditions if c.type == "Ready")
-    edited = first.model_copy(
-        update={
-            "problems": (told.model_copy(update={"since": NOW + 10**9}),),
-            "conditions": (ready.model_copy(update={"last_transition_time": NOW + 10**9}),),
-        }
-    )
-    pod = waiting(1, "ErrImagePull", "no such image")
-    second = status_of(then(POOL, edited), pod, now=NOW + 5)
-    assert second.problems[0].since == NOW + 5
-    assert {c.last_transition_time for c in second.conditions} == {NOW + 5}
-    third = status_of(then(POOL, second), pod, now=NOW + 35)
-    assert third.problems[0].severity == "Error", "it was a warning for half a minute"
-
-
-def test_past_the_limit_the_first_problem_names_the_remedy() -> None:
-    pool = make_pool(replicas=1, failurePolicy={"backoffLimit": 0})
-    status = status_of(pool, ended(1, code=7))
+def test_a_pool_that_is_given_up_names_the_remedy_first() -> None:
+    status = status_of(make_pool(replicas=1, failurePolicy={"backoffLimit": 0}), ended(1, code=7))
     limit, cause = status.problems
     assert (limit.reason, limit.terminal) == ("BackoffLimitExceeded", True)
+    assert (cause.reason, status.phase) == ("ContainerFailed", "Failed")
     assert "exited with code 7" in limit.message
-    assert "spec.suspend" in limit.message
-    for named in ("template", "processesPerPod", "failurePolicy", "update", "a new epoch"):
+    fields = ("template", "processesPerPod", "failurePolicy", "update", "a new epoch")
+    for named in ("spec.suspend", *fields):
         assert named in limit.message
-    assert cause.reason == "ContainerFailed"
-    assert status.phase == "Failed"
-
-
-# -- The pool
-
-
-@pytest.mark.parametrize(
-    ("code", "said", "reason", "terminal"),
-    [
-        (403, "pods is forbidden: exceeded quota: team, requested: cpu=1", "QuotaExceeded", False),
-        (403, 'violates PodSecurity "restricted:latest"', "Forbidden", True),
-        (422, "spec.containers[0].image: Required value", "InvalidTemplate", True),
-    ],
-)
-def test_a_refusal_is_reported_in_the_api_servers_words(
-    code: int, said: str, reason: str, terminal: bool
-) -> None:
-    refused = PodRefusal(template_hash(POOL), code, said, NOW)
-    status = status_of(POOL, refusal=refused)
-    (found,) = status.problems
-    assert (found.reason, found.terminal, found.severity) == (reason, terminal, "Error")
-    assert said in found.message
-    (accepted,) = (c.status for c in status.conditions if c.type == "Accepted")
-    assert accepted == ("True" if reason == "QuotaExceeded" else "False")
-
-
-def test_an_account_that_is_not_there_yet_is_a_warning_first_and_tried_again_at_once() -> None:
-    said = 'pods "es-1" is forbidden: error looking up service account team/default: not found'
-    refused = PodRefusal(template_hash(POOL), 403, said, NOW, 5, True)
-    status = status_of(POOL, refusal=refused)
-    (found,) = status.problems
-    assert (found.reason, found.severity, found.terminal) == ("Forbidden", "Warning", False)
-    later = status_of(then(POOL, status), refusal=refused, now=NOW + 31)
-    assert later.problems[0].severity == "Error"
-    assert plan_of(POOL, refusal=refused).requeue_at == NOW + 1
-
-
-def test_a_full_quota_is_no_problem_to_a_pool_that_wants_no_more() -> None:
-    refused = PodRefusal(template_hash(POOL), 403, "exceeded quota", NOW)
-    assert status_of(POOL, running(1), refusal=refused).problems == ()
-
-
-def test_a_namespace_that_is_deleted_is_no_problem_of_its_pools() -> None:
-    said = "unable to create new content in namespace team because it is being terminated"
-    refused = PodRefusal(template_hash(POOL), 403, f'pods "es-1" is forbidden: {said}', NOW)
-    assert status_of(POOL, refusal=refused).problems == ()
-
-
-def test_an_obstacle_is_reported_unchanged() -> None:
-    obstacle = Obstacle(Reason.NAME_TAKEN, "the Service es-fiber is another's", True)
-    found = problem(POOL, running(1), obstacles=(obstacle,))
-    assert (found.reason, found.message) == ("NameTaken", obstacle.message)
-    assert found.terminal
-
-
-def test_a_lost_master_is_reported_with_the_consequence() -> None:
-    pool = make_pool(replicas=1, master={**MASTER, "leaseName": "es"}, onLost="Delete")
-    expired = plans.LeaseVerdict(alive=False)
-    found = problem(pool, running(1), master=expired)
-    assert found.reason == "MasterLost"
-    for said in ("10.0.3.7:41337", "epoch 1", "laptop-7:4711", "onLost is Delete"):
-        assert said in found.message
-
-
-def test_a_lost_lease_is_reported() -> None:
-    pool = make_pool(replicas=1, master={**MASTER, "leaseName": "es"})
-    seen = then(pool, status_of(pool, running(1), master=plans.LeaseVerdict(alive=True)))
-    found = problem(seen, running(1), master=plans.LeaseVerdict(alive=False, missing=True))
-    assert found.reason == "MasterLost"
-    assert "The Lease es did not exist for 30 s" in found.message
-
-
-def test_a_missing_lease_is_reported_with_the_remedy() -> None:
-    pool = make_pool(replicas=1, master={**MASTER, "leaseName": "se"})
-    first = status_of(pool, running(1), master=plans.LeaseVerdict(missing=True))
-    (found,) = first.problems
-    assert (found.reason, found.severity) == ("LeaseNotFound", "Warning")
-    for said in ("no Lease se in this namespace", "10.0.3.7:41337", "correct spec.master.lease"):
-        assert said in found.message
-    (alive,) = (c for c in first.conditions if c.type == "MasterAlive")
-    assert (alive.status, alive.reason) == ("Unknown", "LeaseNotFound")
-    missing = plans.LeaseVerdict(missing=True)
-    later = problem(then(pool, first), running(1), now=NOW + 30, master=missing)
-    assert (later.reason, later.severity) == ("LeaseNotFound", "Error")
-
-
-def test_a_master_of_the_other_address_family_is_reported() -> None:
-    pool = make_pool(replicas=1, master={**MASTER, "host": "fd00::7"})
-    found = problem(pool, running(1))
-    assert (found.reason, found.terminal) == ("InvalidSpec", True)
-    assert "fd00::7" in found.message
-    assert "delete the Service es-fiber" in found.message
-
-
-def test_a_master_of_either_family_of_the_service_is_right() -> None:
-    addresses = "10.96.1.2:7070,[fd00:96::2]:7070"
-    for host in ("10.0.3.7", "fd00::7"):
-        pool = make_pool(replicas=1, master={**MASTER, "host": host})
-        assert status_of(pool, running(1), address=addresses).problems == ()
-
-
-def test_names_that_are_no_workers_are_reported() -> None:
-    release = {"release": [name_of(1), "es-web", "other-0000000001"]}
-    found = problem(make_pool(replicas=1, scaleDown=release), running(2))
-    assert (found.reason, found.severity, found.count) == ("InvalidRelease", "Warning", 2)
-    assert "es-web, other-0000000001" in found.message
 
 
 def test_the_worst_comes_first_and_there_are_ten_at_most() -> None:

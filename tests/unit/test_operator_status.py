@@ -32,8 +32,9 @@ from unit.operator_objects import (
 Json = dict[str, Any]
 
 
-def told(status: FiberPoolStatus) -> dict[str, tuple[str, str]]:
-    return {found.type: (found.status, found.reason) for found in status.conditions}
+def told(status: FiberPoolStatus) -> dict[str, str]:
+    """Return the status and the reason of each condition."""
+    return {found.type: f"{found.status} {found.reason}" for found in status.conditions}
 
 
 def test_the_status_has_counts_addresses_and_the_selector() -> None:
@@ -64,100 +65,106 @@ def test_the_highest_epoch_is_remembered_without_a_master() -> None:
     assert (status.master, status.master_epoch) == (None, 5)
 
 
-def test_every_condition_is_there_once() -> None:
-    found = told(status_of(make_pool(replicas=1), running(1)))
-    assert found == {
-        "Accepted": ("True", "AsExpected"),
-        "Ready": ("True", "AsExpected"),
-        "Progressing": ("False", "AsExpected"),
-        "Degraded": ("False", "AsExpected"),
-        "MasterAlive": ("Unknown", "NoMaster"),
-        "ScalingLimited": ("False", "WithinBounds"),
-        "Suspended": ("False", "NotSuspended"),
-    }
+# -- Conditions and the phase
+
+AS_EXPECTED = {
+    "Accepted": "True AsExpected",
+    "Ready": "True AsExpected",
+    "Progressing": "False AsExpected",
+    "Degraded": "False AsExpected",
+    "MasterAlive": "Unknown NoMaster",
+    "ScalingLimited": "False WithinBounds",
+    "Suspended": "False NotSuspended",
+}
+ONE, TWO = make_pool(replicas=1), make_pool(replicas=2)
+ATTENDED = make_pool(replicas=1, master=MASTER)
+LEASED = make_pool(replicas=1, master={**MASTER, "leaseName": "es"})
+OLDER = of_template("older", running(1))
+
+
+def seen(alive: bool | None, pool: FiberPool = LEASED, **fields: Any) -> FiberPool:
+    """Return the pool with the status that follows from its master's Lease."""
+    verdict = plans.LeaseVerdict(alive, **fields)
+    return with_plan(pool, plan_of(pool, running(1), master=verdict))
+
+
+def row(expected: str, pool: FiberPool, *pods: Json, **known: Any) -> Any:
+    """Return a pool, its pods, what the operator knows, the phase and the changed conditions."""
+    return pytest.param(pool, pods, known, expected, id=expected.replace("; ", ", "))
+
+
+def lease(alive: bool | None, **fields: Any) -> plans.LeaseVerdict:
+    return plans.LeaseVerdict(alive, **fields)
+
+
+def refused(code: int, message: str) -> plans.PodRefusal:
+    return plans.PodRefusal(template_hash(ONE), code, message, NOW)
+
+
+QUOTA, INVALID = refused(403, "exceeded quota: q"), refused(422, "image: Required value")
+UNCHECKED = "MasterAlive Unknown LeaseNotChecked"
+LOST = "Degraded; MasterAlive False MasterLost; Degraded True MasterLost"
+FAILED = "Ready False ContainerFailed; Progressing True BackingOff; Degraded True ContainerFailed"
+STOPPED = "Ready False Suspended; Progressing True Deleting; Suspended True Suspended"
+FULL = "Ready False QuotaExceeded; Progressing False QuotaExceeded; Degraded True QuotaExceeded"
+WRONG = "Accepted False InvalidTemplate; Ready False InvalidTemplate; Degraded True InvalidTemplate"
 
 
 @pytest.mark.parametrize(
-    ("spec", "pods", "ready", "progressing", "phase"),
+    ("pool", "pods", "known", "expected"),
     [
-        ({}, [], ("True", "ScaledToZero"), ("False", "AsExpected"), "Ready"),
-        ({"replicas": 2}, [], ("False", "Creating"), ("True", "Creating"), "Scaling"),
-        (
-            {"replicas": 1},
-            [pod_document(1)],
-            ("False", "Starting"),
-            ("True", "Starting"),
-            "Scaling",
+        row("Ready", ONE, running(1)),
+        row("Ready; Ready True ScaledToZero", make_pool()),
+        row("Scaling; Ready False Creating; Progressing True Creating", TWO),
+        row("Scaling; Ready False Starting; Progressing True Starting", ONE, pod_document(1)),
+        row(f"Suspended; {STOPPED}", make_pool(replicas=1, suspend=True), terminating(running(1))),
+        row("Scaling; Progressing True Deleting", ONE, running(1), running(2)),
+        row(f"Scaling; Progressing True Draining; {UNCHECKED}", ATTENDED, running(1), running(2)),
+        row(f"Scaling; Progressing True Updating; {UNCHECKED}", ATTENDED, OLDER),
+        row(f"Degraded; {FAILED}", ONE, ended(1)),
+        row("Pending; Accepted Unknown NotJudged; Ready False Creating", ONE, accepted=None),
+        row(f"Degraded; {FULL}", ONE, refusal=QUOTA),
+        row(f"Failed; {WRONG}; Progressing False InvalidTemplate", ONE, refusal=INVALID),
+        row(
+            "Ready; ScalingLimited True AboveMaximum",
+            make_pool(replicas=9, maxReplicas=1),
+            running(1),
         ),
-        (
-            {"replicas": 1, "suspend": True},
-            [terminating(running(1))],
-            ("False", "Suspended"),
-            ("True", "Deleting"),
-            "Suspended",
+        row(
+            "Ready; ScalingLimited True BelowMinimum",
+            make_pool(replicas=1, minReplicas=2),
+            running(1),
+            running(2),
         ),
-        (
-            {"replicas": 1, "master": MASTER},
-            [running(1), running(2)],
-            ("True", "AsExpected"),
-            ("True", "Draining"),
-            "Scaling",
+        row("Ready; ScalingLimited False WithinBounds", make_pool(minReplicas=1), running(1)),
+        row("Ready; MasterAlive True LeaseRenewed", LEASED, running(1), master=lease(True)),
+        row(f"Ready; {UNCHECKED}", LEASED, running(1), master=lease(None)),
+        row(
+            "Ready; MasterAlive Unknown Forbidden",
+            LEASED,
+            running(1),
+            master=lease(None, unreadable="no right"),
         ),
-        (
-            {"replicas": 1, "master": MASTER},
-            [of_template("older", running(1))],
-            ("True", "AsExpected"),
-            ("True", "Updating"),
-            "Scaling",
+        row(
+            "Ready; MasterAlive Unknown LeaseNotFound",
+            LEASED,
+            running(1),
+            master=lease(None, missing=True),
         ),
-        (
-            {"replicas": 1},
-            [ended(1)],
-            ("False", "ContainerFailed"),
-            ("True", "BackingOff"),
-            "Degraded",
-        ),
+        row(LOST, LEASED, running(1), master=lease(False)),
+        # An operator that has just started goes by the status.
+        row("Ready; MasterAlive True LeaseRenewed", seen(True), running(1), master=lease(None)),
+        row(LOST, seen(False), running(1), master=lease(None)),
     ],
 )
-def test_readiness_progress_and_phase(
-    spec: Json,
-    pods: list[Json],
-    ready: tuple[str, str],
-    progressing: tuple[str, str],
-    phase: str,
+def test_each_condition_is_there_once_and_gives_the_phase(
+    pool: FiberPool, pods: list[Json], known: Json, expected: str
 ) -> None:
-    status = status_of(make_pool(**spec), *pods)
-    assert (told(status)["Ready"], told(status)["Progressing"]) == (ready, progressing)
-    assert status.phase == phase
-
-
-@pytest.mark.parametrize(
-    ("spec", "expected"),
-    [
-        ({"replicas": 9, "maxReplicas": 4}, ("True", "AboveMaximum")),
-        ({"replicas": 1, "minReplicas": 2}, ("True", "BelowMinimum")),
-        ({"minReplicas": 2}, ("False", "WithinBounds")),
-    ],
-)
-def test_binding_bounds_are_reported(spec: Json, expected: tuple[str, str]) -> None:
-    assert told(status_of(make_pool(**spec)))["ScalingLimited"] == expected
-
-
-@pytest.mark.parametrize(
-    ("alive", "expected"),
-    [
-        (True, ("True", "LeaseRenewed")),
-        (False, ("False", "MasterLost")),
-        (None, ("Unknown", "LeaseNotChecked")),
-    ],
-)
-def test_the_master_is_alive_if_its_lease_is(alive: bool | None, expected: tuple[str, str]) -> None:
-    pool = make_pool(master={**MASTER, "leaseName": "es"})
-    status = status_of(pool, master=plans.LeaseVerdict(alive=alive))
-    assert told(status)["MasterAlive"] == expected
-    if alive is not None:
-        again = status_of(pool.model_copy(update={"status": status}), master=plans.LeaseVerdict())
-        assert told(again)["MasterAlive"] == expected
+    status = status_of(pool, *pods, **known)
+    phase, *changed = expected.split("; ")
+    conditions = dict(condition.split(" ", 1) for condition in changed)
+    assert told(status) == {**AS_EXPECTED, **conditions}
+    assert (status.phase, len(status.conditions)) == (phase, len(AS_EXPECTED))
 
 
 def test_a_condition_keeps_its_time_until_its_status_changes() -> None:
@@ -223,5 +230,5 @@ def test_an_unreadable_spec_is_reported_and_counts_go_on() -> None:
         "tls+tcp://10.96.1.2:7070",
     )
     assert "spec.replicas" in status.problems[0].message
-    assert told(status)["Accepted"] == ("False", "InvalidSpec")
-    assert told(status)["Degraded"] == ("True", "InvalidSpec")
+    assert told(status)["Accepted"] == "False InvalidSpec"
+    assert told(status)["Degraded"] == "True InvalidSpec"
