@@ -40,7 +40,7 @@ def policy(helm: Helm) -> Manifest:
     return named(helm.render(CREATED), POLICY)
 
 
-def test_is_off_unless_wanted(helm: Helm) -> None:
+def test_the_policy_is_off_by_default(helm: Helm) -> None:
     assert POLICY not in kinds(helm.render())
 
 

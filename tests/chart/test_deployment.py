@@ -130,7 +130,7 @@ def test_images_by_tag_and_by_digest(helm: Helm, image: dict[str, str], expected
     assert images(helm.render({"image": image})) == {expected}
 
 
-def test_where_pods_run_holds_for_the_test_too(helm: Helm) -> None:
+def test_the_pod_of_helm_test_has_the_placement_of_the_operator(helm: Helm) -> None:
     placement = {
         "nodeSelector": {"disk": "ssd"},
         "tolerations": [{"key": "dedicated", "operator": "Exists"}],
@@ -196,7 +196,7 @@ def test_labels_follow_the_conventions(helm: Helm) -> None:
         ("9" * 53, "fiber-" + "9" * 38),
     ],
 )
-def test_names_fit(helm: Helm, release: str, expected: str) -> None:
+def test_long_release_names_give_valid_names(helm: Helm, release: str, expected: str) -> None:
     manifests = helm.render(release=release)
     assert named(manifests, "Deployment")["metadata"]["name"] == expected
     names = [str(manifest["metadata"]["name"]) for manifest in manifests]

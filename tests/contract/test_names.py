@@ -88,7 +88,7 @@ def test_no_secret_is_called_as_cert_managers_usually_are() -> None:
     ("host", "address"),
     [("10.96.1.2", "10.96.1.2:7070"), ("fd00::1", "[fd00::1]:7070")],
 )
-def test_addresses(host: str, address: str) -> None:
+def test_a_host_and_a_port_make_an_address_and_an_endpoint(host: str, address: str) -> None:
     assert names.address_of(host, names.MASTER_PORT) == address
     assert names.endpoint_of(address) == f"tls+tcp://{address}"
 

@@ -43,7 +43,7 @@ def test_an_upgrade_restarts_no_worker(pool: Pool, agent: Body, release: Release
         release.install()
 
 
-def test_helm_test(release: Release) -> None:
+def test_helm_test_succeeds_and_prints_its_steps(release: Release) -> None:
     said = release.helm("test", release.name, "--namespace", release.namespace, "--logs")
     assert "Phase:          Succeeded" in said
     assert "its worker is ready" in said

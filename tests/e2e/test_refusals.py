@@ -72,7 +72,7 @@ def test_an_epoch_is_remembered_after_its_master(pool: Pool, agent: Body) -> Non
 # -- Pods
 
 
-def test_a_quota(pool: Pool, agent: Body) -> None:
+def test_a_quota_that_refuses_pods_is_a_problem(pool: Pool, agent: Body) -> None:
     scene = pool.scene
     quota = scene.path("resourcequotas")
     with watching(scene, "resourcequotas") as quotas:

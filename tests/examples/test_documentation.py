@@ -34,7 +34,7 @@ def programs() -> Iterator[object]:
 
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("program", list(programs()))
-def test_programs_run(program: str, backend: str, tmp_path: Path) -> None:
+def test_programs_of_the_documentation_run(program: str, backend: str, tmp_path: Path) -> None:
     (tmp_path / "program.py").write_text(program, encoding="utf-8")
     done = subprocess.run(
         [sys.executable, "program.py"],

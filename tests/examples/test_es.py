@@ -45,7 +45,7 @@ def test_the_result_does_not_depend_on_the_workers(
     assert train(backend, workers, tmp_path / "curve.png") == alone
 
 
-def test_interrupted(tmp_path: Path) -> None:
+def test_ctrl_c_ends_the_training_and_draws_the_curve(tmp_path: Path) -> None:
     """Ctrl-C ends the training, not the program: the curve so far is drawn."""
     picture = tmp_path / "curve.png"
     arguments = ("--env", "CartPole-v1", "--generations", 10_000, "--out", picture)

@@ -35,7 +35,7 @@ def test_equal_returns_have_equal_ranks(es: Any) -> None:
     np.testing.assert_allclose(ranks, [[-1 / 3, 1 / 6], [-1 / 3, 1 / 2]], rtol=1e-6)
 
 
-def test_evolution_climbs(es: Any) -> None:
+def test_evolution_finds_the_top_of_a_function(es: Any) -> None:
     """Find the known top of a function, with any order of the answers."""
     rng = np.random.default_rng(0)
     noise = rng.standard_normal(10_000, dtype=np.float32)

@@ -60,7 +60,7 @@ def test_scikit_learn_fits_and_searches(executor: fiber.Executor) -> None:
     assert forest.score(images, digits) > 0.9
 
 
-def test_scipys_workers(executor: fiber.Executor) -> None:
+def test_scipy_runs_its_workers_on_an_executor(executor: fiber.Executor) -> None:
     lowest = brute(rosen, [slice(0, 2, 0.5)] * 2, workers=executor.map, finish=None)
     assert lowest.tolist() == [1.0, 1.0]
     found = differential_evolution(
@@ -70,7 +70,7 @@ def test_scipys_workers(executor: fiber.Executor) -> None:
     assert found.fun == alone.fun
 
 
-def test_optunas_trials(executor: fiber.Executor) -> None:
+def test_optuna_runs_its_trials_on_an_executor(executor: fiber.Executor) -> None:
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=1))
     trials = [study.ask() for _ in range(6)]

@@ -8,7 +8,7 @@ from examples.run_example import BACKENDS, run
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_pi(backend: str) -> None:
+def test_the_example_prints_pi(backend: str) -> None:
     done = run("01-pi/pi.py", "1e5", backend=backend)
     text, _, number = done.stdout.strip().rpartition(" ")
     assert text == "Pi is roughly"

@@ -13,7 +13,7 @@ SMALL = ("--workers", 2, "--samples", 200, "--points", 2, "--trials", 4)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_search(backend: str, tmp_path: Path) -> None:
+def test_the_example_prints_both_searches_and_draws_a_picture(backend: str, tmp_path: Path) -> None:
     picture = tmp_path / "search.png"
     done = run("05-search/search.py", *SMALL, "--picture", picture, backend=backend)
     found = re.findall(r"^(grid of 2 x 2|study of 4 trials): ([\d.]+)% with C=", done.stdout, re.M)

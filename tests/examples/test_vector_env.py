@@ -12,7 +12,7 @@ SMALL = ("--envs", 3, "--steps", 40, "--ms", 0.2)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_adopted(backend: str) -> None:
+def test_the_adopted_environments_give_the_same_observations(backend: str) -> None:
     done = run("03-vector-env/adopted.py", *SMALL, backend=backend)
     assert done.stdout.endswith("observations: the same\n")
     rates = re.findall(r"^ *(?:what it takes|0\.2 ms) +([\d,]+) +([\d,]+) ", done.stdout, re.M)
@@ -21,7 +21,7 @@ def test_adopted(backend: str) -> None:
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_piped(backend: str) -> None:
+def test_the_piped_environments_print_rate_and_returns(backend: str) -> None:
     done = run("03-vector-env/piped.py", *SMALL, backend=backend)
     assert re.search(r"^3 x CartPole-v1: [\d,]+ environment steps a second$", done.stdout, re.M)
     ended, mean = re.findall(r"^(\d+) episodes ended, mean return ([\d.]+)$", done.stdout, re.M)[0]

@@ -75,7 +75,9 @@ def test_an_agent_that_fits_is_taken(master: Callable[..., tuple[Program, Progra
     agent.kill()
 
 
-def test_wrong_credentials(master: Callable[..., tuple[Program, Program]], tmp_path: Path) -> None:
+def test_an_agent_with_wrong_credentials_gives_up_early(
+    master: Callable[..., tuple[Program, Program]], tmp_path: Path
+) -> None:
     other = str(tmp_path / "other")
     Path(other).write_text(json.dumps(asdict(make_credentials().agent("newcomer", "uid"))))
     # It gives up long before its timeout.

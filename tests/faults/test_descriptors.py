@@ -249,7 +249,9 @@ LOOPBACK = (
 )
 
 
-def test_with_agents_too(launch: Callable[..., Program]) -> None:
+def test_a_loopback_program_with_few_descriptors_refuses_and_ends(
+    launch: Callable[..., Program],
+) -> None:
     program = launch(LOOPBACK, env={"FIBER_BACKEND": "loopback", "FIBER_AGENTS": "1"})
     assert program.finish() == "TooManyOpenFiles 64 24\nrefused\n0\n"
 

@@ -105,7 +105,7 @@ def test_each_blocking_call_of_a_pool(launch: Callable[..., Program], call: str)
 
 @pytest.mark.parametrize("backend", ["local", "loopback"])
 @pytest.mark.parametrize("call", ["pool.map(time.sleep, [60] * 10)", "child.join()", "queue.get()"])
-def test_in_a_terminal_it_reaches_the_program_alone(
+def test_ctrl_c_in_a_terminal_interrupts_the_program_only(
     launch: Callable[..., Program], backend: str, call: str
 ) -> None:
     script = SCRIPT.format(

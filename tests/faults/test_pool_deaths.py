@@ -340,7 +340,7 @@ def test_an_initializer_that_does_not_pickle() -> None:
 
 
 @pytest.mark.parametrize("chunksize", [None, 1, 5])
-def test_maxtasksperchild(chunksize: int | None) -> None:
+def test_maxtasksperchild_limits_the_chunks_of_a_worker(chunksize: int | None) -> None:
     with fiber.Pool(2, maxtasksperchild=2) as pool:
         pids = pool.map(tasks.pid, range(20), chunksize)
     pool.join()

@@ -138,7 +138,7 @@ CASES = [
 
 
 @pytest.mark.parametrize(("kind", "backend"), CASES)
-def test_everything_works(
+def test_programs_whose_imports_start_threads_work(
     launch: Callable[..., Program], request: pytest.FixtureRequest, kind: str, backend: str
 ) -> None:
     if backend == "kubernetes":

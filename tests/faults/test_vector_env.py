@@ -297,7 +297,7 @@ PROGRAM = """
         ("env.send([Faulty.WAIT] * 3)", "env.recv(1)", "pass"),
     ],
 )
-def test_an_interrupt(
+def test_an_interrupted_environment_goes_on(
     launch_on: Callable[..., Program], prepare: str, call: str, close: str
 ) -> None:
     program = launch_on(PROGRAM.format(prepare=prepare, call=call, close=close))

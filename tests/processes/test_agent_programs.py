@@ -99,7 +99,7 @@ def test_a_folder_that_cannot_be_made_is_tried_again_for_the_next_child(
     assert run(agent, archive) == 3
 
 
-def test_without_a_directory_for_it_no_child_starts() -> None:
+def test_a_child_without_a_directory_for_its_program_does_not_start() -> None:
     loop = Loop()
     loop.start_thread("fiber-io")
     agent = Agent(loop, "here")

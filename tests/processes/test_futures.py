@@ -271,7 +271,7 @@ def test_map_keeps_no_result(executor: fiber.Executor) -> None:
 
 
 @pytest.mark.parametrize("wrong", [{"chunksize": 0}, {"buffersize": 0}, {"chunksize": -1}])
-def test_map_refuses(executor: fiber.Executor, wrong: dict[str, int]) -> None:
+def test_map_refuses_invalid_options(executor: fiber.Executor, wrong: dict[str, int]) -> None:
     with pytest.raises(ValueError, match=r"1\+"):
         executor.map(tasks.square, [1], **wrong)  # type: ignore[arg-type]
 
@@ -372,7 +372,7 @@ def test_dropped_options_leave_no_state_in_the_engine(executor: fiber.Executor) 
     wait_until(lambda: len(engine._ledger.jobs) == before, "their jobs are over")
 
 
-def test_retry_exceptions(tmp_path: Path) -> None:
+def test_an_executor_retries_the_given_exceptions(tmp_path: Path) -> None:
     with fiber.Executor(1, retry_exceptions=ConnectionError) as executor:
         assert executor.submit(tasks.fail_until, tmp_path / "log", 2).result(PATIENCE) == "done"
 

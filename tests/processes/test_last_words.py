@@ -55,7 +55,9 @@ def test_long_stacks_are_cut() -> None:
     assert found.endswith("\n...")
 
 
-def test_without_a_descriptor_there_are_none(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_descriptor_no_file_for_last_words_is_made(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def refuse(*_: object) -> int:
         raise OSError(24, "too many open files")
 

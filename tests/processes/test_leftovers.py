@@ -61,7 +61,7 @@ def test_no_process_of_its_user_reads_a_hidden_one() -> None:
     assert run("hide_this_process()" + SPY) == ""
 
 
-def test_without_that_every_process_of_its_user_reads_it() -> None:
+def test_an_unhidden_process_is_readable_to_processes_of_its_user() -> None:
     assert "reads environ" in run(SPY)
 
 

@@ -383,7 +383,7 @@ def test_any_exception_of_a_signals_handler_ends_a_call_alone(manager: Any) -> N
 # From elsewhere
 
 
-def test_to_connect_takes_an_address() -> None:
+def test_connect_without_an_address_is_refused() -> None:
     with pytest.raises(ValueError, match="needs the address"):
         BaseManager().connect()
 

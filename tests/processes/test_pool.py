@@ -49,7 +49,7 @@ def test_map(pool: Pool, kind: Any, chunksize: int | None) -> None:
 
 
 @pytest.mark.parametrize("chunksize", [None, 1, 7])
-def test_starmap(pool: Pool, chunksize: int | None) -> None:
+def test_starmap_unpacks_the_arguments_of_each_call(pool: Pool, chunksize: int | None) -> None:
     pairs = list(zip(range(30), range(30, 0, -1), strict=True))
     assert pool.starmap(tasks.add, pairs, chunksize) == [30] * 30
     assert pool.starmap(tasks.add, iter(pairs), chunksize) == [30] * 30

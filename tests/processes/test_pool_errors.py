@@ -284,7 +284,7 @@ def run(pool: Pool, call: str, function: Any) -> Any:
 # Retries of tasks that raise
 
 
-def test_retry_exceptions(tmp_path: Any) -> None:
+def test_a_pool_retries_the_given_exceptions(tmp_path: Any) -> None:
     with fiber.Pool(2, retry_exceptions=ConnectionError) as pool:
         assert pool.apply(tasks.fail_until, (tmp_path / "a", 3)) == "done"
         assert tasks.runs(tmp_path / "a") == 4

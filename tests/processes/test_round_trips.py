@@ -98,7 +98,7 @@ def itself(thing: Any) -> Any:
 
 
 @pytest.mark.slow
-def test_from_the_program_to_a_worker_and_back() -> None:
+def test_objects_go_from_the_program_to_a_worker_and_back() -> None:
     with running(agents=1), fiber.Pool(1) as pool:
         for name, kind in KINDS.items():
             thing = kind.make()
@@ -107,7 +107,7 @@ def test_from_the_program_to_a_worker_and_back() -> None:
 
 
 @pytest.mark.slow
-def test_from_a_worker_to_the_program_and_to_another_worker_of_its_host() -> None:
+def test_objects_go_from_a_worker_through_the_program_to_another_worker() -> None:
     with running(agents=1), fiber.Pool(1) as pool, fiber.Pool(1) as other:
         for name, kind in KINDS.items():
             thing = pool.apply_async(made, (name,)).get(PATIENCE)

@@ -118,7 +118,7 @@ def test_a_waiter_killed_while_waiting_takes_no_token() -> None:
     assert semaphore.acquire(timeout=PATIENCE)
 
 
-def test_an_event() -> None:
+def test_an_event_is_set_and_cleared() -> None:
     event = fiber.Event()
     assert not event.is_set()
     assert not event.wait(0)

@@ -111,7 +111,7 @@ def test_it_gives_the_same_as_dummy_vec_env(space: str, vec_env: Make) -> None:
     play_both(vec_env(makes), dummy(makes))
 
 
-def test_with_arrays_that_travel(vec_env: Make) -> None:
+def test_environments_without_shared_memory_give_the_same_as_dummy_vec_env(vec_env: Make) -> None:
     makes = [partial(Sampling, SPACES["dict"], SPACES["array"])] * 3
     play_both(vec_env(makes, shared_memory=False), dummy(makes), 6)
 

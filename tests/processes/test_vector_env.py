@@ -104,7 +104,9 @@ def test_it_gives_the_same_as_sync_vector_env(space: str, vector_env: Make) -> N
 
 @pytest.mark.parametrize("shared_memory", [True, False])
 @pytest.mark.parametrize("mode", list(AutoresetMode))
-def test_in_each_autoreset_mode(mode: AutoresetMode, shared_memory: bool, vector_env: Make) -> None:
+def test_environments_give_the_same_as_sync_vector_env_in_each_autoreset_mode(
+    mode: AutoresetMode, shared_memory: bool, vector_env: Make
+) -> None:
     makes = [partial(Sampling, MIXED, length=2 + number) for number in range(3)]
     env = vector_env(makes, shared_memory=shared_memory, autoreset_mode=mode)
     play_both(env, SyncVectorEnv(makes, autoreset_mode=mode))
@@ -256,7 +258,9 @@ def test_actions_that_do_not_fit(vector_env: Make) -> None:
         (np.array([False, False]), ValueError),
     ],
 )
-def test_bad_masks(mask: Any, error: type[Exception], vector_env: Make) -> None:
+def test_invalid_reset_masks_are_refused(
+    mask: Any, error: type[Exception], vector_env: Make
+) -> None:
     with pytest.raises(error, match="reset_mask"):
         vector_env([Faulty] * 2).reset(options={"reset_mask": mask})
 
@@ -277,7 +281,7 @@ def test_the_order_of_calls(vector_env: Make) -> None:
             call()
 
 
-def test_first_ready(vector_env: Make) -> None:
+def test_recv_returns_the_environments_that_are_ready_first(vector_env: Make) -> None:
     env = vector_env([Faulty] * 5)
     with pytest.raises(ValueError, match="would wait for ever: 0 environments"):
         env.recv(1)
@@ -375,7 +379,7 @@ def test_made_by_id(monkeypatch: pytest.MonkeyPatch) -> None:
         env.close()
 
 
-def test_registered(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_registered_environment_makes_fibers_vector_env(monkeypatch: pytest.MonkeyPatch) -> None:
     spec = gymnasium.spec("CartPole-v1")
     monkeypatch.setattr(spec, "vector_entry_point", spec.vector_entry_point)
     fiber.vector.register("CartPole-v1", num_workers=1)

@@ -67,7 +67,7 @@ def acquires_all(semaphore: SharedSemaphore, tokens: int) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-def test_seeded_schedules(kind: str) -> None:
+def test_locks_keep_their_promises_in_seeded_schedules(kind: str) -> None:
     for seed in range(SEEDS):
         try:
             run(seed, *KINDS[kind])

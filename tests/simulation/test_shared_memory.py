@@ -20,7 +20,7 @@ STEPS = 300
 
 @pytest.mark.slow
 @pytest.mark.parametrize("part", range(PARTS))
-def test_schedules(part: int) -> None:
+def test_shared_memory_keeps_its_promises_in_seeded_schedules(part: int) -> None:
     run_all(range(part, SEEDS, PARTS))
 
 

@@ -307,7 +307,7 @@ TELLING = {
 
 
 @pytest.mark.parametrize("suite", TELLING)
-def test_everything_happens(suite: str) -> None:
+def test_each_kind_of_event_happens_in_the_simulation(suite: str) -> None:
     missing = set(TELLING[suite])
     for seed in range(600):
         trace: list[str] = []

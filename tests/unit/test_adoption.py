@@ -132,7 +132,9 @@ class TestWhatIsRebound:
             ),
         ],
     )
-    def test_names(self, library: Library, fiber: Any, statement: str, path: str) -> None:
+    def test_an_imported_name_is_rebound(
+        self, library: Library, fiber: Any, statement: str, path: str
+    ) -> None:
         module = library(statement)
         Adoption(module, fiber)
         expected = fiber
@@ -211,7 +213,7 @@ class TestWhatWasEvaluatedAtImport:
             ),
         ],
     )
-    def test_is_rebound_and_restored(
+    def test_a_value_from_the_import_is_rebound_and_restored(
         self, library: Library, fiber: Any, source: str, name: str, path: str
     ) -> None:
         module = library(f"import functools, multiprocessing\n{source}")
@@ -415,13 +417,13 @@ class TestDuration:
         assert module.Queue == "mine"
         assert module.multiprocessing is multiprocessing
 
-    def test_after_a_reload_it_can_be_adopted_again(self, module: Any, fiber: Any) -> None:
+    def test_a_reloaded_module_can_be_adopted_again(self, module: Any, fiber: Any) -> None:
         Adoption(module, fiber)
         module.multiprocessing = multiprocessing
         Adoption(module, fiber)
         assert module.multiprocessing is fiber
 
-    def test_many_threads(self, module: Any, fiber: Any) -> None:
+    def test_threads_may_adopt_one_module_at_the_same_time(self, module: Any, fiber: Any) -> None:
         wrong: list[object] = []
         together = threading.Barrier(4, timeout=PATIENCE)
 

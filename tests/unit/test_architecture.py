@@ -45,12 +45,12 @@ def test_imports_follow_the_layers() -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(1200)  # mypy takes 50 s, and over 300 s beside a dozen busy processes
-def test_types() -> None:
+def test_mypy_finds_no_error() -> None:
     run(sys.executable, "-m", "mypy")
 
 
 @pytest.mark.parametrize("arguments", [("check",), ("format", "--check")], ids=" ".join)
-def test_style(arguments: tuple[str, ...]) -> None:
+def test_ruff_finds_no_error(arguments: tuple[str, ...]) -> None:
     run(sys.executable, "-m", "ruff", *arguments, "--no-cache", ".")
 
 

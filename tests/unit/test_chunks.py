@@ -114,6 +114,6 @@ def test_size_is_whole_units_or_all_that_is_left(
 
 
 @given(tasks=st.integers(0, 10**6), workers=st.integers(1, 2000))
-def test_default_chunks_are_multiprocessings(tasks: int, workers: int) -> None:
+def test_the_default_chunksize_is_that_of_multiprocessing(tasks: int, workers: int) -> None:
     size, extra = divmod(tasks, workers * 4)
     assert default_chunksize(tasks, workers) == max(1, size + bool(extra))

@@ -92,7 +92,7 @@ def test_the_first_to_come_is_the_first_to_be_notified(brought: Callable[[Any], 
         thread.join(PATIENCE)
 
 
-def test_all_are_notified_from_elsewhere(brought: Callable[[Any], Any]) -> None:
+def test_notify_all_wakes_the_waiters_of_both_copies(brought: Callable[[Any], Any]) -> None:
     here, woken = fiber.Condition(fiber.Lock()), []
     there = brought(here)
     threads = [waiter(condition, woken, "") for condition in (here, there, here, there)]
@@ -153,7 +153,7 @@ def test_wait_for_returns_the_predicates_value(brought: Callable[[Any], Any]) ->
         assert there.wait_for(lambda: "yes") == "yes"
 
 
-def test_without_the_lock_it_is_refused(brought: Callable[[Any], Any]) -> None:
+def test_wait_and_notify_without_the_lock_are_refused(brought: Callable[[Any], Any]) -> None:
     there = brought(fiber.Condition())
     for call in (there.wait, there.notify, there.notify_all):
         with pytest.raises(AssertionError, match="must acquire"):

@@ -44,7 +44,7 @@ def pyproject(tmp_path: Path) -> Callable[[str], Path]:
 
 
 class TestSources:
-    def test_defaults(self) -> None:
+    def test_the_default_configuration_has_the_documented_values(self) -> None:
         assert load() == Config()
         assert Config().backend == "auto"
         assert Config().retries == 3
@@ -171,7 +171,7 @@ class TestSources:
         environ = dict.fromkeys(config.AGENT_VARIABLES, "x") | {"OTHER": "y"}
         assert load(environ=environ) == Config()
 
-    def test_an_agent_gets_no_other_variables(self) -> None:
+    def test_the_variables_of_an_agent_are_all_known(self) -> None:
         named = {value for value in vars(agent).values() if str(value).startswith("FIBER_AGENT_")}
         assert named <= config.AGENT_VARIABLES
         assert named
@@ -195,7 +195,7 @@ class TestSources:
 
 
 class TestUnknownKeys:
-    def test_in_init(self) -> None:
+    def test_an_unknown_key_in_init_is_named(self) -> None:
         with pytest.raises(ConfigError) as caught:
             load({"agent": 3})
         text = str(caught.value)
@@ -203,7 +203,7 @@ class TestUnknownKeys:
         assert "Did you mean 'agents'?" in text
         assert all(entry.name in text for entry in dataclasses.fields(Config))
 
-    def test_in_the_environment(self) -> None:
+    def test_an_unknown_key_in_the_environment_is_named(self) -> None:
         with pytest.raises(ConfigError) as caught:
             load(environ={"FIBER_BAKEND": "local"})
         text = str(caught.value)
@@ -220,7 +220,7 @@ class TestUnknownKeys:
         with pytest.raises(ConfigError, match=f"{variable}. Did you mean '{meant}'?"):
             load(environ={variable: "4"})
 
-    def test_in_pyproject(self, pyproject: Callable[[str], Path]) -> None:
+    def test_an_unknown_key_in_pyproject_is_named(self, pyproject: Callable[[str], Path]) -> None:
         path = pyproject("[tool.fiber]\nlisten-port = 1")
         with pytest.raises(ConfigError) as caught:
             load()
@@ -291,7 +291,7 @@ class TestBadValues:
             ("runtime_directory", 7, "the absolute path of a directory"),
         ],
     )
-    def test_in_init(self, key: str, value: object, expected: str) -> None:
+    def test_a_bad_value_in_init_is_named(self, key: str, value: object, expected: str) -> None:
         with pytest.raises(ConfigError) as caught:
             load({key: value})
         text = str(caught.value)
@@ -307,13 +307,13 @@ class TestBadValues:
             ("FIBER_START_TIMEOUT", "1m"),
         ],
     )
-    def test_in_the_environment(self, variable: str, text: str) -> None:
+    def test_a_bad_value_in_the_environment_is_named(self, variable: str, text: str) -> None:
         with pytest.raises(ConfigError) as caught:
             load(environ={variable: text})
         assert f"bad value {text!r}" in str(caught.value)
         assert f"environment variable {variable}" in str(caught.value)
 
-    def test_in_pyproject(self, pyproject: Callable[[str], Path]) -> None:
+    def test_a_bad_value_in_pyproject_is_named(self, pyproject: Callable[[str], Path]) -> None:
         path = pyproject("[tool.fiber]\nretries = 'three'")
         with pytest.raises(ConfigError, match="bad value 'three' for 'retries'") as caught:
             load()
@@ -354,12 +354,14 @@ class TestBadValues:
 
 
 class TestCurrent:
-    def test_is_read_once(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_the_current_configuration_is_read_once(self, monkeypatch: pytest.MonkeyPatch) -> None:
         first = config.current()
         monkeypatch.setenv("FIBER_AGENTS", "9")
         assert config.current() is first
 
-    def test_is_one_for_many_threads(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_threads_get_the_same_current_configuration(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         all_there = threading.Barrier(4, timeout=PATIENCE)
 
         def load_at_the_same_time() -> Config:
@@ -483,7 +485,7 @@ class TestInit:
         config.install(Config())
         assert config.init(backend="loopback").backend == "loopback"
 
-    def test_keys_of_later_calls_may_change_while_in_use(self) -> None:
+    def test_init_may_change_keys_for_later_calls_while_fiber_is_in_use(self) -> None:
         config.init(backend="loopback")
         config.guard(lambda: True)
         config.init(backend="loopback", retries=0, start_timeout=5, log_level="info")
@@ -496,7 +498,7 @@ class TestInit:
 
 
 class TestConfig:
-    def test_is_frozen(self) -> None:
+    def test_a_configuration_is_frozen(self) -> None:
         with pytest.raises(dataclasses.FrozenInstanceError):
             Config().agents = 3  # type: ignore[misc]
 

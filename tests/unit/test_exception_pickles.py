@@ -83,7 +83,7 @@ def test_an_exception_keeps_its_class_arguments_and_attributes(
     assert "in travelled" in str(found.__cause__)
 
 
-def test_slots() -> None:
+def test_an_exception_keeps_its_slots() -> None:
     found = travelled(kinds.Slotted(3, 4))
     assert found.hidden() == 4
     assert not hasattr(found, "never_set")

@@ -43,7 +43,7 @@ def pickled() -> list[int]:
 # Giving
 
 
-def test_a_map(rig: Rig) -> None:
+def test_a_map_is_done_when_each_worker_has_answered(rig: Rig) -> None:
     results = rig.map(range(4))
     for handle, child in zip(rig.handles, rig.children, strict=True):
         assert [seq for seq, _ in child.packets]
@@ -53,7 +53,7 @@ def test_a_map(rig: Rig) -> None:
     assert results.done == 1
 
 
-def test_a_call(rig: Rig) -> None:
+def test_a_call_is_done_when_its_worker_has_answered(rig: Rig) -> None:
     results = rig.call()
     (handle,) = rig.busy
     rig.answer(handle, rig.child(handle).packets[0][0], [9])
@@ -182,7 +182,7 @@ def test_a_pickler_may_raise_anything(rig: Rig, tries: int) -> None:
     assert type(failure.error) is SystemExit
 
 
-def test_broadcast(rig: Rig) -> None:
+def test_a_broadcast_goes_once_to_each_worker(rig: Rig) -> None:
     results = Results()
     rig.executor.broadcast(results, tasks.pid, ())
     assert [len(child.packets) for child in rig.children] == [1, 1]

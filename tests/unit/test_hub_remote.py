@@ -109,7 +109,9 @@ def test_an_interrupted_confirmation_is_not_waited_for_again(
     assert [here.recv() for _ in range(3)] == [1, 3, 4]
 
 
-def test_poll(far_pipe: tuple[Connection, Connection]) -> None:
+def test_poll_of_a_remote_connection_reports_a_message(
+    far_pipe: tuple[Connection, Connection],
+) -> None:
     here, there = far_pipe
     assert not there.poll()
     assert not there.poll(0.01)
@@ -315,7 +317,7 @@ def test_a_message_for_another_receiver_is_not_announced(far: Far) -> None:
 # Counters
 
 
-def test_a_counter_from_afar(far: Far) -> None:
+def test_a_counter_of_another_host_works_like_a_local_one(far: Far) -> None:
     counter = LocalCounter.create(2)
     remote = far(counter)
     assert isinstance(remote, RemoteCounter)

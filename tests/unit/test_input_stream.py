@@ -198,7 +198,7 @@ def test_a_reader_ends_with_the_stream_before_it_has_used_its_credit() -> None:
     assert reading.read == [1, 2]
 
 
-def test_the_end_stops_grants() -> None:
+def test_an_ended_input_stream_gets_no_grant() -> None:
     reading = Reading()
     reading.stream.end()
     reading.grant()

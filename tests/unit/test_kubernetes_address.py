@@ -91,13 +91,15 @@ def test_the_way_to_the_nodes(cluster: Cluster, listen_host: str | None) -> None
     assert cluster.found(listen_host) == "172.30.0.1"
 
 
-def test_without_the_right_to_list_nodes_the_way_to_the_api_server(cluster: Cluster) -> None:
+def test_without_the_right_to_list_nodes_the_address_toward_the_api_server_is_used(
+    cluster: Cluster,
+) -> None:
     cluster.server = "api.example"
     cluster.ways["api.example"] = "10.1.2.3"
     assert cluster.found() == "10.1.2.3"
 
 
-def test_in_a_pod_the_pods_address_and_no_call(cluster: Cluster) -> None:
+def test_a_program_in_a_pod_uses_the_pods_address_without_a_call(cluster: Cluster) -> None:
     cluster.in_cluster, cluster.server = True, "10.96.0.1"
     cluster.ways["10.96.0.1"] = "10.244.0.9"
     assert cluster.found() == "10.244.0.9"
@@ -110,7 +112,7 @@ def test_the_way_out_where_the_api_server_is_a_loopback(cluster: Cluster) -> Non
 
 
 @pytest.mark.parametrize("useless", ["127.0.0.1", "::1", "fe80::1%eth0", "169.254.3.4"])
-def test_where_only_a_loopback_is_found(cluster: Cluster, useless: str) -> None:
+def test_a_loopback_address_is_refused_with_advice(cluster: Cluster, useless: str) -> None:
     cluster.ways |= {"127.0.0.1": useless, "192.0.2.1": useless}
     with pytest.raises(FiberPoolError, match="FIBER_LISTEN_HOST") as caught:
         cluster.found()

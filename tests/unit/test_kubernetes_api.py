@@ -114,7 +114,7 @@ def test_an_invalid_kubeconfig_is_named(
 
 
 @pytest.mark.parametrize("package", ["kubernetes", "pathspec"])
-def test_without_a_package_it_says_how_to_install_it(
+def test_the_error_of_a_missing_package_says_how_to_install_it(
     package: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, package, None)
@@ -240,7 +240,7 @@ def _server_side(made: Certificates, folder: Path) -> ssl.SSLContext:
     return context
 
 
-def test_in_a_pod_its_account_is_used(
+def test_a_program_in_a_pod_uses_the_pods_account(
     account: tuple[Served, Path], connect: Callable[..., Api]
 ) -> None:
     server, _ = account

@@ -103,7 +103,7 @@ def test_no_change_is_lost_when_a_watch_ends(case: Case, how: str) -> None:
     assert "-b" not in told
 
 
-def test_after_an_end_it_goes_on_without_a_list(case: Case) -> None:
+def test_an_informer_continues_an_ended_watch_without_a_list(case: Case) -> None:
     case.add("a")
     case.watch.start()
     case.next()

@@ -221,7 +221,7 @@ def test_the_live_line_is_removed_before_a_refusal(
     pods.close()
 
 
-def test_a_wait_for_the_api_server_says_so(site: Site) -> None:
+def test_the_timeout_error_says_that_the_api_server_does_not_answer(site: Site) -> None:
     waits = threading.Event()
     pods = site.pods(lambda cancel: waits.set() or until_the_end(cancel), Config(pod_timeout=0.1))
     child, owner = site.start()

@@ -50,14 +50,14 @@ UNSCHEDULABLE = problem(
 
 
 class TestWarnings:
-    def test_say_pool_reason_number_and_message(self) -> None:
+    def test_a_warning_has_pool_reason_number_and_message(self) -> None:
         (text,) = new_problems(POOL, {}, status(problem("ImagePullError", pods=3)))
         assert text == (
             "the FiberPool 'es-1a2b3c' in namespace 'team': ImagePullError (3 pods): "
             "what, why, what to do."
         )
 
-    def test_come_once(self) -> None:
+    def test_a_warning_is_given_once(self) -> None:
         first = status(problem("ImagePullError", pods=1))
         second = status(problem("ImagePullError", "in other words", pods=3))
         assert list(new_problems(POOL, first, second)) == []
@@ -72,7 +72,7 @@ class TestWarnings:
         assert list(new_problems(POOL, status(UNSCHEDULABLE), {})) == []
 
     @pytest.mark.parametrize("reason", ["LeaseNotFound", "MasterLost"])
-    def test_are_not_of_the_program_itself_which_lives(self, reason: str) -> None:
+    def test_a_program_gets_no_warning_about_its_own_lease(self, reason: str) -> None:
         """The operator may look between the pool's making and the Lease's."""
         found = status(problem(reason, severity="Warning"), desiredReplicas=2)
         assert list(new_problems(POOL, {}, found)) == []
@@ -157,7 +157,7 @@ class TestOverdue:
 
 
 class TestUnreachable:
-    def test_says_the_address_the_reasons_and_the_remedies(self) -> None:
+    def test_the_error_of_unreachable_pods_has_address_reasons_and_remedies(self) -> None:
         error = unreachable(POOL, status(replicas=3, pendingReplicas=1), 8.0, WAY)
         assert error.reason == "Unreachable"
         assert "no agent of its 2 running pods has reached this program at 10.0.0.7:41337" in str(
@@ -174,13 +174,13 @@ class TestUnreachable:
 
 
 class TestSummary:
-    def test_has_the_schedulers_words_and_for_how_long(self) -> None:
+    def test_a_summary_has_the_schedulers_message_and_its_age(self) -> None:
         counts = {"desiredReplicas": 50, "readyReplicas": 12, "pendingReplicas": 30}
         assert summary(status(UNSCHEDULABLE, **counts), NOW) == (
             f"12 of 50 pods ready, 30 pending: {SCHEDULER} (for 14 s)"
         )
 
-    def test_has_the_first_sentence_of_other_problems(self) -> None:
+    def test_a_summary_has_the_first_sentence_of_other_problems(self) -> None:
         message = "es-1 cannot get its image: manifest unknown. If the image is wrong, correct it."
         told = status(problem("ImagePullError", message, pods=1), desiredReplicas=1)
         assert summary(told, NOW) == (
@@ -194,7 +194,7 @@ class TestSummary:
         assert "..." in told
         assert "\n" not in summary(status(problem("A", "first\nsecond")), NOW)
 
-    def test_without_problems_has_the_counts(self) -> None:
+    def test_a_summary_without_problems_has_the_counts(self) -> None:
         assert summary(status(desiredReplicas=2, readyReplicas=2), NOW) == "2 of 2 pods ready"
 
     def test_an_empty_status_is_named(self) -> None:

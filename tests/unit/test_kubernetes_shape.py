@@ -86,7 +86,7 @@ class TestTemplates:
             ("pod.yml", "apiVersion: v1\nkind: Pod\nspec:\n  nodeSelector: {gpu: 'yes'}\n"),
         ],
     )
-    def test_are_read_from_a_file(self, tmp_path: Path, file: str, text: str) -> None:
+    def test_a_template_is_read_from_a_file(self, tmp_path: Path, file: str, text: str) -> None:
         (tmp_path / file).write_text(text)
         assert read_template(str(tmp_path / file)) == GPU
 

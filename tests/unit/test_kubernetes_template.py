@@ -211,7 +211,7 @@ class TestInAPod:
     def test_a_pod_runs_the_agent_with_the_programs_interpreter(self) -> None:
         assert worker_of(like())["command"] == [PYTHON, "-m", "fiber.agent"]
 
-    def test_in_another_image_it_is_the_one_that_is_found(self) -> None:
+    def test_a_pod_with_another_image_runs_the_agent_of_that_image(self) -> None:
         worker = worker_of(like(PodShape(image="es:1")))
         assert worker["command"] == AGENT
         assert worker["image"] == "es:1"
@@ -332,7 +332,7 @@ class TestTheUsersTemplate:
         worker = worker_of(self.template({"containers": [{"name": "worker", field: ["x"]}]}))
         assert {key: worker[key] for key in worker if key in ("command", "args")} == {field: ["x"]}
 
-    def test_may_have_metadata(self) -> None:
+    def test_the_template_of_a_user_may_have_metadata(self) -> None:
         template = like(PodShape.of(Config(template={"metadata": {"labels": {"team": "a"}}})))
         assert template["metadata"] == {"labels": {"team": "a"}}
 
@@ -344,10 +344,10 @@ class TestOwnContainer:
         "- ext4 /dev/sda1 rw\n"
     )
 
-    def test_is_the_one_whose_files_are_mounted(self) -> None:
+    def test_the_own_container_is_found_by_its_mounts(self) -> None:
         assert own_container(POD, self.MOUNTINFO) == "main"
 
-    def test_else_the_one_that_kubectl_takes(self) -> None:
+    def test_kubectls_default_container_is_taken_if_the_own_is_unknown(self) -> None:
         pod = copy.deepcopy(POD)
         assert own_container(pod, "") == "proxy"
         pod["metadata"]["annotations"] = {"kubectl.kubernetes.io/default-container": "main"}

@@ -208,7 +208,9 @@ def test_an_answer_to_attaching_that_is_lost(rig: Rig, told: Told) -> None:
     assert "master" not in spec(rig)
 
 
-def test_being_replaced_is_an_error_and_the_successor_is_left_alone(rig: Rig, told: Told) -> None:
+def test_a_replaced_master_gets_an_error_and_leaves_its_successor_alone(
+    rig: Rig, told: Told
+) -> None:
     client = rig.warm(told)
     has_master(rig, told, 1)
     told.wait(lambda: told.statuses)

@@ -41,7 +41,7 @@ def test_a_latch_stays_set() -> None:
     assert latch.wait(0)
 
 
-def test_all_waiters_go_on() -> None:
+def test_a_latch_wakes_all_waiters() -> None:
     latch = Latch()
     went_on: list[bool] = []
     threads = [
@@ -192,7 +192,7 @@ def test_a_finalizer_at_any_allocation_may_set_it() -> None:
 
 
 @pytest.mark.parametrize("timeout", [None, float("inf"), 10**400])
-def test_no_limit_is_too_long(timeout: float | None) -> None:
+def test_acquire_accepts_any_timeout(timeout: float | None) -> None:
     lock = threading.Lock()
     assert acquire(lock, timeout)
 

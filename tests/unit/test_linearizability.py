@@ -68,13 +68,13 @@ CASES: dict[str, tuple[Callable[..., None], Callable[[], Any], Any, Any]] = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_on_one_host(case: str) -> None:
+def test_histories_of_one_host_are_linearizable(case: str) -> None:
     target, make, model, state = CASES[case]
     assert is_linearizable(history(target, make()), model, state)
 
 
 @pytest.mark.parametrize("case", ["Lock", "RLock", "Semaphore", "BoundedSemaphore", "SimpleQueue"])
-def test_between_hosts(case: str) -> None:
+def test_histories_between_hosts_are_linearizable(case: str) -> None:
     target, make, model, state = CASES[case]
     hosts = Hosts()
     hosts.link("b", "a")

@@ -66,7 +66,7 @@ def test_a_malformed_name_is_given_up_in_time_and_named(site: Site) -> None:
 
 
 @pytest.mark.slow
-def test_where_there_is_no_thread_for_a_moment_it_is_tried_again(
+def test_an_agent_dials_again_after_a_thread_could_not_be_started(
     site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     listener, master = site.listener()

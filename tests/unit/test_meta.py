@@ -92,7 +92,7 @@ class TestOwnership:
         assert resources_of(library.plain) == Resources()
         assert resources_of(len) == Resources()
 
-    def test_decorator(self, library: Any) -> None:
+    def test_a_decorated_function_has_its_resources(self, library: Any) -> None:
         assert resources_of(library.decorated) == Resources(cpu=2, memory=1024)
 
     def test_a_shared_function_stays_clean(self, library: Any) -> None:
@@ -101,7 +101,7 @@ class TestOwnership:
         assert resources_of(library.plain) == Resources()
         assert vars(library.plain) == {}
 
-    def test_a_local_function_stays_clean(self) -> None:
+    def test_meta_leaves_a_local_function_unchanged(self) -> None:
         def local() -> int:
             return 1
 
@@ -114,7 +114,7 @@ class TestOwnership:
         assert resources_of(both) == Resources(cpu=9, memory=10)
         assert resources_of(library.small) == Resources(cpu=1)
 
-    def test_methods(self, library: Any) -> None:
+    def test_decorated_methods_have_their_resources(self, library: Any) -> None:
         assert resources_of(library.Model.train) == Resources(gpu=2)
         assert resources_of(library.Model().train) == Resources(gpu=2)
         assert resources_of(library.Model.evaluate) == Resources(gpu=3)
@@ -170,7 +170,7 @@ class TestBehaviour:
         assert "plain" in repr(library.small)
         assert "cpu=1.0" in repr(library.small)
 
-    def test_methods_bind(self, library: Any) -> None:
+    def test_decorated_methods_bind_to_their_object(self, library: Any) -> None:
         assert library.Model().train(1) == 101
         assert library.Model.evaluate(1) == 1
 
@@ -192,7 +192,7 @@ class TestBehaviour:
 
 class TestPickle:
     @pytest.mark.parametrize("name", ["decorated", "rebound", "small", "large"])
-    def test_by_plain_pickle(self, library: Any, name: str) -> None:
+    def test_a_decorated_function_survives_plain_pickle(self, library: Any, name: str) -> None:
         original = getattr(library, name)
         back = round_trip(original)
         assert back(1) == original(1)
@@ -205,7 +205,7 @@ class TestPickle:
     def test_a_shared_function_travels_by_its_own_name(self, library: Any) -> None:
         assert round_trip(library.small).__wrapped__ is library.plain
 
-    def test_methods(self, library: Any) -> None:
+    def test_decorated_methods_survive_pickle(self, library: Any) -> None:
         assert round_trip(library.Model.train) is library.Model.train
         assert round_trip(library.Model().train)(1) == 101
 
@@ -246,7 +246,7 @@ class TestValues:
     @pytest.mark.parametrize(
         ("given", "cpu"), [(1, 1.0), (0.5, 0.5), ("500m", 0.5), ("2", 2.0), ("1.5", 1.5)]
     )
-    def test_cpu(self, given: float | str, cpu: float) -> None:
+    def test_meta_takes_numbers_and_quantities_of_cpu(self, given: float | str, cpu: float) -> None:
         assert resources_of(meta(cpu=given)(print)) == Resources(cpu=cpu)
 
     @pytest.mark.parametrize(
@@ -257,7 +257,7 @@ class TestValues:
         assert resources_of(meta(memory=given)(print)) == Resources(memory=memory)
 
     @pytest.mark.parametrize("gpu", [0, 4])
-    def test_gpu(self, gpu: int) -> None:
+    def test_meta_takes_whole_numbers_of_gpu(self, gpu: int) -> None:
         assert resources_of(meta(gpu=gpu)(print)) == Resources(gpu=gpu)
 
     @pytest.mark.parametrize(

@@ -87,7 +87,7 @@ async def test_all_are_created(api: KubernetesApi, door: Cluster) -> None:
 
 
 @pytest.mark.parametrize(("status", "kind"), [(403, "refusal"), (422, "refusal"), (404, "failure")])
-def test_a_refusal_is_the_end(status: int, kind: str) -> None:
+def test_a_refused_creation_ends_the_batch(status: int, kind: str) -> None:
     @played
     async def test(api: KubernetesApi, door: Cluster) -> None:
         api.faults.append(Fault("create", "pods", status=status, skip=5, times=100))

@@ -31,7 +31,7 @@ def pulling(numbers: range, *, age: float) -> list[Json]:
     return [waiting(number, "ContainerCreating", age=age) for number in numbers]
 
 
-def test_a_few_try_out_a_template_that_never_worked() -> None:
+def test_three_pods_try_out_a_template_that_never_worked() -> None:
     pool = make_pool(replicas=100)
     assert plan_of(pool).create == 3
     assert plan_of(pool, running(1, age=4), *pulling(range(2, 4), age=4)).create == 97

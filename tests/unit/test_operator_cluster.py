@@ -241,7 +241,7 @@ def test_an_answer_that_is_no_list_is_not_an_empty_one(text: str) -> None:
     with_api(test)
 
 
-def test_a_page_not_found_is_not_an_object_gone() -> None:
+def test_a_404_that_is_no_status_document_is_unavailable() -> None:
     """A proxy, or an API server that does not serve the resource yet."""
 
     async def test(api: KubernetesApi, door: Cluster) -> None:

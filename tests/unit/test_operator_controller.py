@@ -205,7 +205,7 @@ async def test_an_invalid_template_makes_no_pod(world: World) -> None:
 
 
 @played()
-async def test_a_template_is_tried_once(world: World) -> None:
+async def test_a_template_gets_one_dry_run(world: World) -> None:
     world.make_pool(replicas=3)
     await world.ready(3)
     world.edit(replicas=9)

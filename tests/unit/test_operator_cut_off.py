@@ -139,7 +139,7 @@ async def test_workers_of_a_master_that_dial_an_old_address_stay_and_are_reporte
 
 
 @played
-async def test_a_template_that_says_where_to_dial_is_taken_at_its_word(world: World) -> None:
+async def test_a_template_with_an_agent_address_is_not_reported_as_cut_off(world: World) -> None:
     env = [{"name": "FIBER_AGENT_ADDRESS", "value": "10.0.0.1:7"}]
     container = {**TEMPLATE["spec"]["containers"][0], "env": env}
     world.make_pool(replicas=2, template={"spec": {"containers": [container]}})

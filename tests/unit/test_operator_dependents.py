@@ -109,7 +109,7 @@ def test_a_secret_that_names_the_pool_as_its_owner_is_taken() -> None:
 
 
 @played
-async def test_names_are_the_pools_and_fibers(world: World) -> None:
+async def test_objects_with_likely_names_of_users_do_not_collide_with_a_pools(world: World) -> None:
     """<pool>-tls is what cert-manager is told to write to, <pool>-master is a likely Service."""
     for plural, name in (("secrets", "es-tls"), ("services", "es-master"), ("leases", "es")):
         world.store.create(plural, NAMESPACE, {"metadata": {"name": name}})

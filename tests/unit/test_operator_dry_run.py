@@ -139,7 +139,7 @@ WEBHOOK = 'admission webhook "images.example" denied the request: not signed yet
         (403, "no right", True, Reason.FORBIDDEN),
     ],
 )
-def test_400_blames_the_template_in_a_dry_run_alone(
+def test_a_400_blames_the_template_only_in_a_dry_run(
     status: int, message: str, dry_run: bool, reason: Reason
 ) -> None:
     assert PodRefusal("hash", status, message, NOW, dry_run=dry_run).reason == reason

@@ -51,7 +51,7 @@ def ready(number: int, *, since: float = NOW) -> PodView:
 
 
 @given(waves=st.integers(-1, 10**9), seed=st.text())
-def test_waits_double_up_to_the_longest_and_a_tenth_more(waves: int, seed: str) -> None:
+def test_delays_double_up_to_the_longest_with_a_tenth_of_jitter(waves: int, seed: str) -> None:
     due = min(60, 5 * 2 ** min(max(waves - 1, 0), 10))
     assert due <= delay(POLICY, waves, seed) <= due * 1.1
     assert delay(POLICY, waves, seed) == delay(POLICY, waves, seed)

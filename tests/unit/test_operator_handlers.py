@@ -249,7 +249,7 @@ async def test_a_silent_watch_is_given_up(kopf: Watching) -> None:
 
 
 @played()
-async def test_late_events_are_reported_late(kopf: Watching) -> None:
+async def test_delayed_events_are_reported(kopf: Watching) -> None:
     await kopf.watched()
     kopf.api.watch_delay = 20
     kopf.world.make_pool()

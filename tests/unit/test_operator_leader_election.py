@@ -157,7 +157,7 @@ async def test_the_lease_of_one_that_died_is_taken_when_it_has_run_out(found: Op
 
 
 @played
-async def test_a_container_that_was_restarted_goes_on_at_once(found: Operators) -> None:
+async def test_a_restarted_container_becomes_the_leader_at_once(found: Operators) -> None:
     first = found.start("pod-1")
     await until(lambda: first.is_leader)
     await found.kill("pod-1")

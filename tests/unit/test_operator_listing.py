@@ -50,7 +50,7 @@ def test_a_list_is_read_whole(
     assert read(data.encode(), size) == (items, "next")
 
 
-def test_the_last_part_has_no_more() -> None:
+def test_the_last_page_of_a_list_has_no_continue_token() -> None:
     assert read(json.dumps(a_list([])).encode()) == ([], "")
 
 

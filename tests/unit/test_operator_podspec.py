@@ -392,7 +392,7 @@ def test_a_worker_has_requests_that_its_template_does_not_set(
     assert "resources" not in other
 
 
-def test_the_pool_of_a_program_has_settings_of_the_program() -> None:
+def test_the_pool_of_a_program_gets_no_default_requests() -> None:
     document = pool_document()
     document["metadata"]["labels"] = {names.LABEL_MANAGED_BY: names.SDK_MANAGER}
     made = pod(FiberPool.read(document), "es-0000000001", "a:1", REQUESTS)

@@ -399,7 +399,7 @@ def test_a_pool_that_is_given_up_names_the_remedy_first() -> None:
         assert named in limit.message
 
 
-def test_the_worst_comes_first_and_there_are_ten_at_most() -> None:
+def test_at_most_ten_problems_are_reported_the_worst_first() -> None:
     reasons = ["ErrImagePull", "InvalidImageName", "CreateContainerError", "RunContainerError"]
     pods = [waiting(number, reason) for number, reason in enumerate(reasons)]
     warnings = {name_of(number): f"Failed{number}: x" for number in range(20, 30)}

@@ -401,7 +401,9 @@ def test_only_pods_that_the_cluster_ends_are_disrupted(
 
 @settings(max_examples=20, deadline=None)
 @given(replicas=st.integers(1, 12), limit=st.integers(0, 4))
-def test_a_template_that_fails_comes_to_an_end(replicas: int, limit: int) -> None:
+def test_a_failing_template_is_given_up_and_a_corrected_one_works(
+    replicas: int, limit: int
+) -> None:
     policy = {"backoffBaseSeconds": 1, "backoffMaxSeconds": 8, "backoffLimit": limit}
     model = Model(pool_document(replicas=replicas, failurePolicy=policy), fails=True)
     for _ in range(80):

@@ -164,7 +164,7 @@ def test_a_worker_without_a_master_is_neither_replaced_nor_a_failure() -> None:
     assert (made.delete, made.create) == ((), 0)
 
 
-def test_without_a_master_everyone_waits_on_purpose() -> None:
+def test_workers_without_a_master_are_ready_and_not_connected() -> None:
     """Even who was made for one that left before the two had met."""
     status = status_of(make_pool(minReplicas=2), running(1), joining(2))
     assert (status.ready_replicas, status.connected_replicas, status.phase) == (2, 0, "Ready")

@@ -46,7 +46,7 @@ def test_each_watch_must_have_begun() -> None:
     assert said == "changes are seen late: watch fiberpools in one has not begun yet"
 
 
-def test_when_kopf_begins_again_its_watches_do_and_the_informers_goes_on() -> None:
+def test_a_restart_of_kopf_reopens_its_watches_but_not_the_informers() -> None:
     watches = all_well()
     watches.started(False)
     watches.started(True)

@@ -131,7 +131,7 @@ def test_recall_returns_unsent_packets_in_order(ends: tuple[Outbox, socket.socke
     assert received(theirs) == b"afterwards"
 
 
-def test_a_peer_that_is_gone_swallows_everything(
+def test_descriptors_sent_to_a_closed_peer_are_closed(
     ends: tuple[Outbox, socket.socket],
 ) -> None:
     box, theirs = ends

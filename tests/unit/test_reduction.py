@@ -211,7 +211,7 @@ def test_blame_leaves_no_descriptor_of_a_multiprocessing_queue_open() -> None:
     assert open_files() == before
 
 
-def test_blame_is_for_refusals_only() -> None:
+def test_blame_returns_other_errors_unchanged() -> None:
     reason = RuntimeError("the user's own")
     assert reduction.blame({"it": 1}, reason) is reason
 

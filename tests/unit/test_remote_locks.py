@@ -221,7 +221,7 @@ def test_a_link_that_ends_is_an_error_and_gives_it_back(here: Any, far: Far, hos
         there.release()
 
 
-def test_while_a_link_is_cut_it_waits(here: Any) -> None:
+def test_a_remote_lock_waits_while_its_link_is_cut(here: Any) -> None:
     hosts = Hosts()
     wires: tuple[Wire, Wire] = hosts.link("b", "a")
     try:

@@ -118,7 +118,7 @@ def test_processes_of_a_host_have_the_same_memory(far: Far, hosts: Hosts) -> Non
         assert memory_of(far(array)).identity == memory_of(one).identity
 
 
-def test_at_home_it_is_the_memory_itself(far: Far, hosts: Hosts) -> None:
+def test_a_block_that_returns_home_is_the_original_memory(far: Far, hosts: Hosts) -> None:
     with hosts.at("a"):
         array = fiber.RawArray("i", 3)
     data = pickle.dumps(far(array))

@@ -69,7 +69,7 @@ def test_a_timed_out_wait_leaves_no_waiter() -> None:
     assert found._done._waiters._locks == []
 
 
-def test_all_waiters_go_on() -> None:
+def test_a_latch_wakes_all_waiters() -> None:
     found = result()
     threads = [threading.Thread(target=found.wait) for _ in range(3)]
     for thread in threads:

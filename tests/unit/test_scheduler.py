@@ -187,7 +187,7 @@ def test_a_pool_whose_tasks_wait_until_results_are_read_shrinks_and_grows_again(
     assert scheduler.decide(12.0).start == 2
 
 
-def test_without_an_idle_timeout_all_stay() -> None:
+def test_without_an_idle_timeout_idle_workers_stay() -> None:
     scheduler, _ = pool(0, 2)
     job_of(scheduler, 2)
     start(scheduler, scheduler.decide(0.0))
@@ -414,7 +414,7 @@ def fail_all(scheduler: Scheduler, decisions: Decisions, now: float) -> None:
         scheduler.gone(member, now, failure=RAISED)
 
 
-def test_after_a_failure_it_asks_to_be_asked_again_and_tries_one() -> None:
+def test_after_failures_the_scheduler_pauses_and_tries_one_worker() -> None:
     scheduler = Scheduler(3, 3)
     fail_all(scheduler, scheduler.decide(0.0), 0.0)
     decisions = scheduler.decide(0.0)

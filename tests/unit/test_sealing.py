@@ -86,7 +86,7 @@ def test_a_changed_message_does_not_open(at: int) -> None:
 
 
 @pytest.mark.parametrize("size", [0, 15])
-def test_a_message_too_short_to_be_sealed(size: int) -> None:
+def test_a_message_that_is_too_short_to_be_sealed_is_refused(size: int) -> None:
     with pytest.raises(ProtocolError, match=f"cannot have {size} bytes"):
         Opener(SECRET).open(bytes(size))
 

@@ -69,7 +69,7 @@ def found(path: Path) -> str | None:
         "..env.swp",
     ],
 )
-def test_names_of_secrets(tmp_path: Path, name: str) -> None:
+def test_files_with_names_of_secrets_are_found(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
     path.parent.mkdir(exist_ok=True)
     path.write_text("x")
@@ -107,20 +107,20 @@ def test_names_of_secrets(tmp_path: Path, name: str) -> None:
         "#",
     ],
 )
-def test_names_of_files_that_are_not_secret(tmp_path: Path, name: str) -> None:
+def test_files_with_harmless_names_are_not_secret(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_text("x")
     assert found(tmp_path / name) is None
 
 
 @pytest.mark.parametrize("name", [".aws", ".envs", ".ssh", ".Kube"])
-def test_folders_of_secrets(name: str) -> None:
+def test_folders_with_names_of_secrets_are_found(name: str) -> None:
     assert program_files.secret_in_folder(name)
 
 
 @pytest.mark.parametrize(
     "name", ["aws", "envs", "environments", "gcloud", "gh", "secrets", ".github"]
 )
-def test_folders_that_are_not_secret(name: str) -> None:
+def test_folders_with_harmless_names_are_not_secret(name: str) -> None:
     assert program_files.secret_in_folder(name) is None
 
 
@@ -154,7 +154,7 @@ SECRETS = {
 
 
 @pytest.mark.parametrize("name", SECRETS)
-def test_contents_of_secrets(tmp_path: Path, name: str) -> None:
+def test_files_with_secret_contents_are_found(tmp_path: Path, name: str) -> None:
     (tmp_path / "notes.txt").write_text(SECRETS[name])
     assert found(tmp_path / "notes.txt")
     (tmp_path / "module.py").write_text(SECRETS[name])
@@ -177,7 +177,7 @@ def test_contents_of_secrets(tmp_path: Path, name: str) -> None:
         CERTIFICATE,
     ],
 )
-def test_contents_that_are_not_secret(tmp_path: Path, text: str) -> None:
+def test_files_with_harmless_contents_are_not_secret(tmp_path: Path, text: str) -> None:
     (tmp_path / "notes.txt").write_text(text)
     assert found(tmp_path / "notes.txt") is None
 

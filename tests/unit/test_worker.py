@@ -174,7 +174,7 @@ def test_stop_iteration_does_not_end_a_batch(rig: Rig, mode: dict[str, int]) -> 
 
 
 @MODES
-def test_starmap(rig: Rig, mode: dict[str, int]) -> None:
+def test_a_worker_unpacks_the_arguments_of_starmap(rig: Rig, mode: dict[str, int]) -> None:
     items = [(x, 10) for x in range(10)]
     seq = rig.give(tasks.add, items, kind=work.STAR, **mode)
     assert rig.channel.results(seq) == [x + 10 for x in range(10)]
@@ -186,7 +186,7 @@ def test_results_that_do_not_pickle(rig: Rig, mode: dict[str, int]) -> None:
     assert [kind for kind, _ in found] == [work.ERROR] * 3
 
 
-def test_calls(rig: Rig) -> None:
+def test_a_worker_answers_a_batch_of_calls(rig: Rig) -> None:
     seq = rig.call(
         (tasks.add, (1,), {"y": 2}), (tasks.raise_value_error, (5,), {}), (tasks.pid, (), {})
     )
@@ -263,7 +263,7 @@ def test_a_batch_that_does_not_unpickle_is_reported(rig: Rig) -> None:
     assert (kind, seq) == (work.UNREADABLE, 3)
 
 
-def test_stop(rig: Rig) -> None:
+def test_a_stop_message_ends_the_worker(rig: Rig) -> None:
     payload = memoryview(work.SEQ.pack(0) + work.STOP_MESSAGE)
     assert not rig.worker.handle(packet.Message(payload, [], []))
 

@@ -84,7 +84,7 @@ def test_newcomers_are_wanted_for_tasks_that_only_they_may_run(workers: PoolWork
     assert workers.missing(1, 5) == 0, "more than the maximum"
 
 
-def test_counts(workers: PoolWorkerSet) -> None:
+def test_the_worker_set_counts_its_workers(workers: PoolWorkerSet) -> None:
     one, other = start(workers, ready=True), start(workers)
     assert (workers.size, workers.starting) == (2, 1)
     workers.let_go(other)
@@ -209,7 +209,7 @@ def test_pauses_between_waves_double_up_to_a_limit(workers: PoolWorkerSet) -> No
     assert pauses == pytest.approx([min(FIRST_PAUSE * 2**n, LAST_PAUSE) for n in range(9)])
 
 
-def test_after_a_pause_one_is_tried(workers: PoolWorkerSet) -> None:
+def test_after_a_pause_one_worker_is_tried(workers: PoolWorkerSet) -> None:
     fail(workers, 10.0)
     assert workers.startable(4, 10.0) == 0
     assert workers.startable(4, 10.0 + FIRST_PAUSE) == 1
