@@ -96,7 +96,7 @@ lint: $(VENV)/.with-dev
 	$(BIN)/lint-imports
 
 ## make bench         every measurement, beside the installed peers; writes docs/benchmarks
-bench: $(VENV)/.with-bench $(VENV)/.with-vector-peers
+bench: $(VENV)/.with-bench $(VENV)/.with-jax $(VENV)/.with-vector-peers
 	$(BIN)/python -m benchmarks
 
 ## make bench-operator  FiberPools beside ReplicaSets with thousands of pretended pods; floods (root, Go)

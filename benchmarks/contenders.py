@@ -15,6 +15,7 @@ _PROCESSES = frozenset({"pipes", "sharing", "start", "cold start", "endings", "l
 _GUARDED = frozenset({"guarded endings"})
 VECTOR = frozenset({"vector steps", "cart poles"})
 FIRST_READY = frozenset({"first ready"})
+_WITH_JAX = frozenset({"start with jax"})
 _AGAINST_BASELINE = frozenset({"placed pipes", "agents", "import"})
 
 
@@ -65,7 +66,14 @@ ALL = (
         "fiber",
         "Fiber",
         ("fiber",),
-        _POOL | _PROCESSES | _GUARDED | _AGAINST_BASELINE | VECTOR | FIRST_READY | {"fake workers"},
+        _POOL
+        | _PROCESSES
+        | _GUARDED
+        | _WITH_JAX
+        | _AGAINST_BASELINE
+        | VECTOR
+        | FIRST_READY
+        | {"fake workers"},
         "#0072B2",
         "o",
         environment={"FIBER_BACKEND": "local"},
@@ -74,7 +82,7 @@ ALL = (
         "fiber-loopback",
         "Fiber, loopback agents",
         ("fiber",),
-        _POOL | _PROCESSES | _GUARDED | VECTOR | FIRST_READY,
+        _POOL | _PROCESSES | _GUARDED | _WITH_JAX | VECTOR | FIRST_READY,
         "#56B4E9",
         "s",
         environment={"FIBER_BACKEND": "loopback"},
@@ -109,10 +117,11 @@ ALL = (
         "forkserver",
         "multiprocessing, forkserver",
         (),
-        frozenset({"start", "cold start"}),
+        frozenset({"start", "cold start"}) | _WITH_JAX,
         "#666666",
         "d",
     ),
+    Contender("spawn", "multiprocessing, spawn", (), _WITH_JAX, "#aaaaaa", "X"),
     Contender(
         "concurrent.futures",
         "concurrent.futures",

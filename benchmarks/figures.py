@@ -15,6 +15,7 @@ from benchmarks import (
     coldstart,
     endings,
     executors,
+    jax_start,
     large_messages,
     latency,
     overhead,
@@ -191,6 +192,15 @@ def _coldstart(run: Run, path: Path) -> None:
     _finish(figure, path)
 
 
+def _jax_start(run: Run, path: Path) -> None:
+    figure, panels = plt.subplots(1, 2, figsize=(12, 3.5), sharey=True)
+    names = [case.name for case in jax_start.cases(run.about["size"])]
+    for panel, metric in zip(panels, (jax_start.FIRST, jax_start.SECOND), strict=True):
+        _rows(panel, run, names, metric)
+        panel.set(title=f"The {metric.label} of a program", xlabel="time to its first map")
+    _finish(figure, path)
+
+
 def _workers(run: Run, path: Path) -> None:
     figure, panel = plt.subplots(figsize=(9, 4))
     points = [(float(count), workers.workers(count)) for count in workers.WORKERS]
@@ -252,6 +262,7 @@ DRAW: Mapping[str, Callable[[Run, Path], None]] = {
     "sharing": _sharing,
     "startup": _startup,
     "coldstart": _coldstart,
+    "jax_start": _jax_start,
     "workers": _workers,
     "agents": _agents,
     "endings": _endings,
