@@ -18,6 +18,7 @@ PAGES = sorted(
     [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("[!.]*/**/README.md")],
 )
 FENCED = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+BENCHMARKS = (ROOT / "docs" / "benchmarks" / "README.md").read_text(encoding="utf-8")
 LINK = re.compile(r"\]\(([^)\s#]+)[^)]*\)")
 
 
@@ -51,6 +52,26 @@ def test_programs_of_the_documentation_run(program: str, backend: str, tmp_path:
 
 def test_the_readme_shows_a_program() -> None:
     assert FENCED.search((ROOT / "README.md").read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize(
+    ("figure", "row"),
+    [
+        (r"runs (\d+) times as many tasks", "no-op tasks, chunksize 1"),
+        (
+            r"`apply` takes ([\d.]+) times as long",
+            "latency of one apply, function of __main__, p50",
+        ),
+        (r"through a pipe ([\d.]+) times", "Pipe round trip, 1 MB"),
+    ],
+)
+def test_the_readme_has_the_figures_of_the_benchmarks(figure: str, row: str) -> None:
+    measured = re.search(rf"^\| {row} \|.*\| ([\d.]+)x \|", BENCHMARKS, re.MULTILINE)
+    shown = re.search(figure, (ROOT / "README.md").read_text(encoding="utf-8"))
+    assert measured is not None
+    assert shown is not None
+    decimals = len(shown[1].partition(".")[2])
+    assert shown[1] == f"{float(measured[1]):.{decimals}f}"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
