@@ -12,8 +12,9 @@ FAST := $(BIN)/python -m pytest $(SIDE_BY_SIDE) $(FAST_TESTS)
 WHOLE_PROGRAMS := tests/chart tests/examples tests/faults tests/processes
 # Tests that depend most on the interpreter: pickling, starting and ending processes, threads, locks.
 ESSENTIAL_TESTS := $(patsubst %,tests/processes/test_%.py,connection context exit_functions futures \
-	loopback pool process queues synchronize) tests/unit/test_reduction.py tests/unit/test_worker.py \
-	tests/faults/test_children.py tests/faults/test_pool_deaths.py tests/conformance/test_executors.py
+	loopback pool process queues synchronize) $(patsubst %,tests/unit/test_%.py,reduction \
+	shared_objects worker) $(patsubst %,tests/faults/test_%.py,children pool_deaths) \
+	tests/conformance/test_executors.py
 OTHER_PYTHONS = $(shell .ci/python others $(BIN)/python)
 PARTS = test-prepare test-modules $(addprefix test-python-,$(OTHER_PYTHONS)) test-programs \
 	test-side-by-side

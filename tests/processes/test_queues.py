@@ -44,13 +44,6 @@ class Unpicklable:
 # In one process
 
 
-def test_items_come_out_as_they_went_in() -> None:
-    queue: Any = fiber.Queue()
-    for item in (1, "two", None, {"three": [4]}):
-        queue.put(item)
-    assert [queue.get() for _ in range(4)] == [1, "two", None, {"three": [4]}]
-
-
 def test_size_is_right_as_soon_as_put_returns() -> None:
     queue = fiber.Queue()
     assert queue.qsize() == 0
@@ -61,25 +54,6 @@ def test_size_is_right_as_soon_as_put_returns() -> None:
     queue.get()
     assert queue.qsize() == 0
     assert queue.empty()
-
-
-def test_a_full_queue_refuses() -> None:
-    queue = fiber.Queue(2)
-    queue.put(1)
-    assert not queue.full()
-    queue.put(2, timeout=1)
-    assert queue.full()
-    with pytest.raises(Full):
-        queue.put(3, block=False)
-    with pytest.raises(Full):
-        queue.put_nowait(3)
-    with pytest.raises(Full):
-        queue.put(3, timeout=0.01)
-    with pytest.raises(Full):
-        queue.put(3, timeout=-1)
-    assert queue.get() == 1
-    queue.put(3, timeout=-1)
-    assert [queue.get(), queue.get()] == [2, 3]
 
 
 def test_a_place_that_is_given_back_twice_is_removed() -> None:
@@ -116,20 +90,6 @@ def test_without_a_positive_maxsize_it_is_never_full(maxsize: int) -> None:
         queue.put(number, block=False)
     assert not queue.full()
     assert queue.qsize() == MORE_THAN_FITS
-
-
-def test_an_empty_queue_says_so() -> None:
-    queue = fiber.Queue()
-    with pytest.raises(Empty):
-        queue.get(block=False)
-    with pytest.raises(Empty):
-        queue.get_nowait()
-    with pytest.raises(Empty):
-        queue.get(timeout=0.01)
-    with pytest.raises(Empty):
-        queue.get(timeout=-1)
-    queue.put(1)
-    assert queue.get(timeout=-1) == 1
 
 
 @pytest.mark.parametrize("kind", [fiber.Queue, fiber.JoinableQueue])
@@ -490,15 +450,6 @@ def test_join_ends_although_the_last_worker_died_before_it_could_say(
     queue._unfinished.take(0)
     joiner.join(PATIENCE)
     assert not joiner.is_alive()
-
-
-def test_task_done_once_too_often() -> None:
-    queue: Any = fiber.JoinableQueue()
-    queue.put(1)
-    queue.get()
-    queue.task_done()
-    with pytest.raises(ValueError, match="too many times"):
-        queue.task_done()
 
 
 def test_an_unpicklable_item_does_not_count_as_an_unfinished_task(

@@ -23,41 +23,6 @@ def start(target: Callable[..., Any], *args: Any) -> fiber.Process:
     return process
 
 
-def test_a_semaphore_counts() -> None:
-    semaphore = fiber.Semaphore(2)
-    assert semaphore.acquire()
-    assert semaphore.get_value() == 1
-    assert semaphore.acquire()
-    assert semaphore.get_value() == 0
-    assert not semaphore.acquire(False)
-    assert not semaphore.acquire(False, 100)
-    assert not semaphore.acquire(timeout=0.01)
-    assert not semaphore.acquire(timeout=-1)
-    semaphore.release()
-    assert semaphore.acquire(timeout=-1)
-    for _ in range(3):
-        semaphore.release()
-    assert semaphore.get_value() == 3
-    assert repr(semaphore) == "<Semaphore(value=3)>"
-
-
-def test_a_semaphore_is_a_context() -> None:
-    semaphore = fiber.Semaphore()
-    with semaphore as acquired:
-        assert acquired
-        assert semaphore.get_value() == 0
-    assert semaphore.get_value() == 1
-
-
-def test_a_bounded_semaphore_refuses_a_surplus_release() -> None:
-    semaphore = fiber.BoundedSemaphore(2)
-    with pytest.raises(ValueError, match="too many times"):
-        semaphore.release()
-    semaphore.acquire()
-    semaphore.release()
-    assert repr(semaphore) == "<BoundedSemaphore(value=2, maxvalue=2)>"
-
-
 @pytest.mark.parametrize("value", [-1, synchronize.SEM_VALUE_MAX + 1])
 def test_a_value_that_cannot_be(value: int) -> None:
     with pytest.raises((OSError, OverflowError), match=str(value)):
@@ -116,24 +81,6 @@ def test_a_waiter_killed_while_waiting_takes_no_token() -> None:
     process.join(PATIENCE)
     semaphore.release()
     assert semaphore.acquire(timeout=PATIENCE)
-
-
-def test_an_event_is_set_and_cleared() -> None:
-    event = fiber.Event()
-    assert not event.is_set()
-    assert not event.wait(0)
-    assert not event.wait(0.01)
-    assert not event.wait(-1)
-    assert "unset" in repr(event)
-    event.set()
-    event.set()
-    assert event.is_set()
-    assert event.wait()
-    assert event.wait(0)
-    assert repr(event).endswith(" set>")
-    event.clear()
-    event.clear()
-    assert not event.is_set()
 
 
 def wait_and_answer(event: Any, ready: Any, answers: Any) -> None:

@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import os
 import pickle
-import select
 from multiprocessing.connection import wait
-from queue import Empty, Full
 from typing import Any
 
 import numpy as np
@@ -20,51 +18,13 @@ from census import wait_until
 from fiber._hub.client import HubStream, ObjectUnreachable
 from fiber._hub.handles import collecting_grants
 from fiber._hub.local import LocalChannel, LocalCounter
-from fiber._hub.remote import RemoteChannel, RemoteCounter
+from fiber._hub.remote import RemoteCounter
 from fiber._hub.streams import WINDOW
 from fiber.connection import Connection
-from fiber.errors import ConnectionClosed
 from hosts import Far, Hosts, background, objects_kept
 from patience import PATIENCE
 
 # Channels
-
-
-def test_messages_go_both_ways(far_pipe: tuple[Connection, Connection]) -> None:
-    here, there = far_pipe
-    assert isinstance(there._channel, RemoteChannel)
-    there.send({"to": ["home"]})
-    assert here.recv() == {"to": ["home"]}
-    here.send("away")
-    assert there.recv() == "away"
-    there.send_bytes(b"")
-    assert here.recv_bytes() == b""
-    here.send_bytes(b"")
-    assert there.recv_bytes() == b""
-
-
-def test_boundaries_are_kept(far_pipe: tuple[Connection, Connection]) -> None:
-    here, there = far_pipe
-    sizes = [0, 1, 70_000, 5, 131_071, 131_072, 131_073, 3]
-    for size in sizes:
-        there.send_bytes(bytes(size))
-        assert here.recv_bytes() == bytes(size)
-    sender = background(lambda: [here.send_bytes(bytes(size)) for size in sizes])
-    assert [len(there.recv_bytes()) for _ in sizes] == sizes
-    sender.join()
-
-
-def test_large_messages_and_arrays_pass(far_pipe: tuple[Connection, Connection]) -> None:
-    here, there = far_pipe
-    item = {"text": "x" * 5_000_000, "arrays": [np.arange(500_000), np.zeros(0), np.ones(9_000)]}
-    for source, sink in ((here, there), (there, here)):
-        sender = background(source.send, item)
-        got = sink.recv()
-        sender.join()
-        assert got["text"] == item["text"]
-        for array, copy in zip(item["arrays"], got["arrays"], strict=True):
-            assert (array == copy).all()
-            assert copy.flags.writeable
 
 
 def test_an_unconfirmed_message_keeps_its_place(far_pipe: tuple[Connection, Connection]) -> None:
@@ -107,84 +67,6 @@ def test_an_interrupted_confirmation_is_not_waited_for_again(
     there._send_unconfirmed(3)
     there.send(4)
     assert [here.recv() for _ in range(3)] == [1, 3, 4]
-
-
-def test_poll_of_a_remote_connection_reports_a_message(
-    far_pipe: tuple[Connection, Connection],
-) -> None:
-    here, there = far_pipe
-    assert not there.poll()
-    assert not there.poll(0.01)
-    assert not there.poll(-1)
-    here.send(1)
-    assert there.poll()
-    assert there.poll(None)
-    assert there.recv() == 1
-    assert not there.poll()
-    here.close()
-    assert there.poll()
-    with pytest.raises(EOFError):
-        there.recv()
-
-
-def test_a_pipe_in_one_direction_stays_so_on_another_host(far: Far) -> None:
-    reader, writer = fiber.Pipe(duplex=False)
-    far_writer = far(writer)
-    with pytest.raises(OSError, match="write-only"):
-        far_writer.recv()
-    far_writer.send(1)
-    assert reader.recv() == 1
-
-
-def test_the_end_comes_when_the_far_holder_closes(far_pipe: tuple[Connection, Connection]) -> None:
-    here, there = far_pipe
-    there.send("last words")
-    there.close()
-    assert here.recv() == "last words"
-    with pytest.raises(EOFError):
-        here.recv()
-    with pytest.raises(OSError, match="handle is closed"):
-        there.recv()
-
-
-def test_sending_without_a_receiver_fails(far_pipe: tuple[Connection, Connection]) -> None:
-    here, there = far_pipe
-    here.close()
-    with pytest.raises(BrokenPipeError):
-        there.send(1)
-
-
-def test_a_blocked_receiver_gets_the_end(far_pipe: tuple[Connection, Connection]) -> None:
-    here, there = far_pipe
-    ends: list[type[BaseException]] = []
-
-    def receive() -> None:
-        try:
-            there.recv()
-        except EOFError as error:
-            ends.append(type(error))
-
-    thread = background(receive)
-    here.close()
-    thread.join(PATIENCE)
-    assert ends == [ConnectionClosed]
-
-
-def test_a_full_pipe_makes_the_sender_wait(far_pipe: tuple[Connection, Connection]) -> None:
-    here, there = far_pipe
-    sent: list[int] = []
-
-    def send_all() -> None:
-        for number in range(2000):
-            there.send(number)
-            sent.append(number)
-
-    thread = background(send_all)
-    # The pipe's buffer takes some hundreds.
-    assert wait_until(lambda: bool(sent), PATIENCE)
-    assert [here.recv() for _ in range(2000)] == list(range(2000))
-    thread.join(PATIENCE)
-    assert len(sent) == 2000
 
 
 def test_threads_that_wait_do_not_wait_for_each_other(far: Far) -> None:
@@ -258,21 +140,6 @@ def test_a_handle_used_twice_says_so(hosts: Hosts, far: Far) -> None:
 # Waiting for several
 
 
-def test_wait_is_right_before_and_after_receiving(far_pipe: tuple[Connection, Connection]) -> None:
-    here, there = far_pipe
-    for _ in range(3):
-        assert wait([there], 0) == []
-        here.send(1)
-        here.send(2)
-        assert wait([there], 0) == [there]
-        assert there.recv() == 1
-        assert wait([there], 0) == [there]
-        assert there.recv() == 2
-    assert wait([there, here], 0) == []
-    here.close()
-    assert wait([there], PATIENCE) == [there]
-
-
 def test_wait_mixes_near_and_far(far: Far) -> None:
     pipes = [fiber.Pipe() for _ in range(4)]
     readers = [far(reader) if n % 2 else reader for n, (reader, _) in enumerate(pipes)]
@@ -284,21 +151,6 @@ def test_wait_mixes_near_and_far(far: Far) -> None:
     assert got == {0, 1, 2, 3}
     for reader in readers:
         reader.close()
-
-
-def test_a_kept_descriptor_stays_right(far_pipe: tuple[Connection, Connection]) -> None:
-    here, there = far_pipe
-    poller = select.poll()
-    poller.register(there.fileno(), select.POLLIN)
-    for number in range(20):
-        assert poller.poll(0) == []
-        here.send(number)
-        if number % 2:
-            here.send(number)
-            assert poller.poll(PATIENCE * 1000)
-            assert there.recv() == number
-        assert poller.poll(PATIENCE * 1000)
-        assert there.recv() == number
 
 
 def test_a_message_for_another_receiver_is_not_announced(far: Far) -> None:
@@ -349,65 +201,4 @@ def test_changes_are_seen_from_afar_by_all(far: Far) -> None:
     for thread in waiting:
         thread.join(PATIENCE)
         assert not thread.is_alive()
-    remote.close()
-
-
-def test_an_event_and_a_semaphore_from_afar(far: Far) -> None:
-    event, semaphore = fiber.Event(), fiber.BoundedSemaphore(1)
-    far_event, far_semaphore = far([event, semaphore])
-    assert not far_event.wait(0.01)
-    waiting = background(far_event.wait, PATIENCE)
-    event.set()
-    waiting.join(PATIENCE)
-    assert far_event.is_set()
-    far_event.clear()
-    assert not event.is_set()
-    with far_semaphore:
-        assert not semaphore.acquire(False)
-    with pytest.raises(ValueError, match="too many times"):
-        far_semaphore.release()
-
-
-# Queues
-
-
-def test_a_queue_from_afar(far: Far) -> None:
-    queue: Any = fiber.Queue(3)
-    remote: Any = far(queue)
-    for number in range(3):
-        remote.put(number)
-    assert remote.full()
-    assert remote.qsize() == queue.qsize() == 3
-    with pytest.raises(Full):
-        remote.put(3, timeout=0.01)
-    with pytest.raises(Full):
-        remote.put_nowait(3)
-    assert queue.get(timeout=PATIENCE) == 0
-    assert [remote.get(), remote.get(timeout=PATIENCE)] == [1, 2]
-    assert remote.empty()
-    with pytest.raises(Empty):
-        remote.get(timeout=0.01)
-    with pytest.raises(Empty):
-        remote.get_nowait()
-    queue.put("home")
-    assert wait([remote._reader], PATIENCE) == [remote._reader]
-    assert remote.get_nowait() == "home"
-    remote.put("away")
-    remote.close()
-    remote.join_thread()
-    assert queue.get(timeout=PATIENCE) == "away"
-
-
-def test_a_joinable_queue_from_afar(far: Far) -> None:
-    queue: Any = fiber.JoinableQueue()
-    remote: Any = far(queue)
-    queue.put(1)
-    joiners = [background(queue.join), background(remote.join)]
-    assert remote.get() == 1
-    assert all(joiner.is_alive() for joiner in joiners)
-    remote.task_done()
-    for joiner in joiners:
-        joiner.join(PATIENCE)
-    with pytest.raises(ValueError, match="too many times"):
-        remote.task_done()
     remote.close()

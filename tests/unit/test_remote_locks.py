@@ -96,14 +96,6 @@ def test_an_rlock_of_another_host_is_its_threads(far: Far) -> None:
         there.release()
 
 
-@pytest.mark.parametrize("name", ["Lock", "BoundedSemaphore"])
-def test_a_release_too_many_is_refused(name: str, far: Far) -> None:
-    there = far(MAKERS[name]())
-    with pytest.raises(ValueError, match="too many times"):
-        there.release()
-    assert there.acquire(timeout=PATIENCE)
-
-
 def test_a_semaphore_carries_signals_between_hosts(far: Far) -> None:
     here = fiber.Semaphore(0)
     there = far(here)
