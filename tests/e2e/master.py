@@ -60,14 +60,18 @@ class Api:
         """The master's, for the key of the pool."""
         return make_credentials(identity.key_in(self._call("GET", self._secret)["data"]))
 
-    def attach(self, master: dict[str, Any]) -> int:
-        """Be the pool's master, with an epoch above those of all before; which that is."""
+    def attach(self, master: dict[str, Any], on_epoch: Callable[[int], None]) -> int:
+        """Be the pool's master, with an epoch above those of all before; which that is.
+
+        ``on_epoch`` gets it before an agent can dial.
+        """
         epoch = 0
 
         def next_one(pool: dict[str, Any]) -> dict[str, Any]:
             nonlocal epoch
             there = pool["spec"].get("master", {}).get("epoch", 0)
             epoch = 1 + int(max(there, pool.get("status", {}).get("masterEpoch", 0)))
+            on_epoch(epoch)
             return {"master": {**master, "epoch": epoch}}
 
         self._apply(next_one)
@@ -172,7 +176,7 @@ def main() -> None:
     if lost_grace is not None:
         master["lostGraceSeconds"] = lost_grace
     started = time.monotonic()
-    epoch = api.attach(master)
+    epoch = api.attach(master, listener.take_epoch)
     say("attached", address=listener.address, epoch=epoch)
     told = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: told.set())

@@ -109,7 +109,7 @@ class AgentKubelet:
             if secret is not None and address is not None and self.fails_with is None:
                 break
             await self._store.changed()
-        folder = self._mount(name, pod["metadata"]["uid"], secret["data"])
+        folder = self._mount(pod, secret["data"])
         environment = {
             **{key: value for key, value in os.environ.items() if not key.startswith("FIBER_")},
             **_environment(pod),
@@ -136,15 +136,18 @@ class AgentKubelet:
         master = self._store.get("fiberpools", namespace, pool)["spec"].get("master")
         return None if master is None else names.address_of(master["host"], master["port"])
 
-    def _mount(self, pod: str, uid: str, data: Body) -> Path:
+    def _mount(self, pod: Body, data: Body) -> Path:
         """The worker's files, after its init container."""
-        folder = self._folders[pod] = Path(tempfile.mkdtemp(prefix="pod-"))
+        name, uid = pod["metadata"]["name"], pod["metadata"]["uid"]
+        told = {v["name"]: v.get("value") for v in pod["spec"]["initContainers"][0]["env"]}
+        folder = self._folders[name] = Path(tempfile.mkdtemp(prefix="pod-"))
         with tempfile.TemporaryDirectory() as key:
-            for name, value in data.items():
-                (Path(key) / name).write_bytes(base64.b64decode(value))
+            for entry, value in data.items():
+                (Path(key) / entry).write_bytes(base64.b64decode(value))
             environment = {
                 names.ENV_KEY: key,
-                names.ENV_NAME: pod,
+                names.ENV_EPOCH: told[names.ENV_EPOCH],
+                names.ENV_NAME: name,
                 names.ENV_UID: uid,
                 names.ENV_CREDENTIALS: str(folder / names.CREDENTIALS_FILE),
             }

@@ -12,7 +12,7 @@ import subprocess
 import sys
 import textwrap
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
@@ -66,8 +66,9 @@ MASTER = """
     listener = MasterListener(
         loop, sys.argv[2], pickle.load(open(sys.argv[1], "rb")),
         on_agent=joined, on_refused=lambda reason: None,
-        keepalive=Keepalive(0.2, 0.5, 1.0), lost_grace=float(sys.argv[3]) if sys.argv[3:] else None,
+        keepalive=Keepalive(0.2, 0.5, 1.0), lost_grace=float(sys.argv[4]) if sys.argv[4:] else None,
     )
+    listener.take_epoch(int(sys.argv[3]))
     print("listens", flush=True)
     loop.run()
 """
@@ -85,8 +86,9 @@ class Pool:
             free.bind(("127.0.0.1", 0))
             self.address = f"127.0.0.1:{free.getsockname()[1]}"
 
-    def agent(self, grace: float, script: str = AGENT, **env: str) -> Program:
-        inherited = self.credentials.agent("warm-0", "uid").to_descriptor()
+    def agent(self, grace: float, script: str = AGENT, epoch: int = 0, **env: str) -> Program:
+        credentials = replace(self.credentials.agent("warm-0", "uid"), epoch=epoch)
+        inherited = credentials.to_descriptor()
         told = {
             "FIBER_AGENT_ADDRESS": self.address,
             "FIBER_AGENT_CREDENTIALS": f"fd:{inherited}",
@@ -105,8 +107,8 @@ class Pool:
         path.write_bytes(pickle.dumps(make_credentials("cd" * 32)))
         return self.master(path=path)
 
-    def master(self, *grace: str, path: Path | None = None) -> Program:
-        master = self._launch(MASTER, str(path or self._path), self.address, *grace)
+    def master(self, *grace: str, path: Path | None = None, epoch: int = 0) -> Program:
+        master = self._launch(MASTER, str(path or self._path), self.address, str(epoch), *grace)
         assert master.line() == "listens"
         return master
 
@@ -138,6 +140,26 @@ def test_an_agent_serves_one_master_after_the_other_and_keeps_no_state(pool: Poo
         f"fiber agent warm-0: the master at {pool.address} refused this agent: "
         "this master is ending"
     }
+
+
+def test_an_agent_serves_no_master_before_the_one_that_its_pod_was_made_for(pool: Pool) -> None:
+    agent = pool.agent(grace=30, epoch=2)
+    earlier = pool.master(epoch=1)
+    wait_for(lambda: "this agent belongs to a later one, of epoch 2" in agent.stderr)
+    earlier.kill()
+    assert pool.master(epoch=2).line() == "joined warm-0"
+
+
+def test_an_agent_that_refuses_all_later_masters_ends(pool: Pool) -> None:
+    """The first master claims an epoch that the pool never had."""
+    agent = pool.agent(grace=1)
+    first = pool.master(epoch=2**53)
+    assert first.line() == "joined warm-0"
+    first.signal(signal.SIGTERM)
+    assert first.wait() == 0
+    pool.master(epoch=2)
+    assert agent.wait() == 0
+    assert f"this agent belongs to a later one, of epoch {2**53}" in agent.stderr
 
 
 PLANTED = """

@@ -7,6 +7,7 @@ import os
 import stat
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -51,6 +52,7 @@ def mounted(folder: Path, credentials: MasterCredentials) -> dict[str, str]:
         names.ENV_KEY: str(folder),
         names.ENV_NAME: "es-1",
         names.ENV_UID: "77",
+        names.ENV_EPOCH: "3",
         names.ENV_CREDENTIALS: str(folder / "agent.json"),
     }
 
@@ -70,7 +72,7 @@ def test_the_agent_reads_the_init_containers_output_once(
     file = tmp_path / "agent.json"
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
     assert credentials.pool_key not in file.read_text()
-    assert Credentials.from_file(file) == credentials.agent("es-1", "77")
+    assert Credentials.from_file(file) == replace(credentials.agent("es-1", "77"), epoch=3)
     assert not file.exists()
 
 

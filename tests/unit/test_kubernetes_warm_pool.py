@@ -113,6 +113,16 @@ def test_the_next_master_has_a_higher_epoch_and_the_same_lease(rig: Rig, told: T
     assert taken["spec"]["acquireTime"] == taken["spec"]["renewTime"]
 
 
+def test_the_epoch_is_told_before_an_agent_can_dial(
+    rig: Rig, told: Told, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[tuple[int, bool]] = []
+    monkeypatch.setattr(told, "on_epoch", lambda epoch: seen.append((epoch, "master" in spec(rig))))
+    rig.warm(told)
+    has_master(rig, told, 1)
+    assert seen == [(1, False)]
+
+
 def test_a_lease_without_the_label_gets_it(rig: Rig, told: Told) -> None:
     name = names.master_lease_name("warm")
     rig.server.do(rig.server.store.create, "leases", NAMESPACE, {"metadata": {"name": name}})

@@ -262,7 +262,7 @@ def test_a_master_of_an_earlier_epoch_is_refused(site: Site) -> None:
     served = replace(site.credentials.agent("agent-1", "uid"), epoch=4)
     _, agent = site.dialer(listener.address, credentials=served)
     agent.wait(lambda: agent.errors)
-    assert "has epoch 3, and this agent has served a later one, of epoch 4" in str(agent.errors[0])
+    assert "has epoch 3, and this agent belongs to a later one, of epoch 4" in str(agent.errors[0])
 
 
 @pytest.mark.parametrize(

@@ -129,6 +129,22 @@ def test_the_init_container_names_the_pod_whatever_the_template_says() -> None:
     assert env["FIBER_AGENT_KEY"]["value"] == "/etc/fiber/key"
 
 
+@pytest.mark.parametrize(
+    ("master", "status", "epoch"),
+    [
+        (None, {}, "0"),
+        (None, {"masterEpoch": 4}, "4"),
+        ({**MASTER, "epoch": 5}, {"masterEpoch": 4}, "5"),
+    ],
+)
+def test_an_agent_knows_the_highest_epoch_before_its_pod(
+    master: Json | None, status: Json, epoch: str
+) -> None:
+    pool = make_pool(status=status, **({} if master is None else {"master": master}))
+    (first,) = pod(pool, "es-0000000001", "a:1")["spec"]["initContainers"]
+    assert {"name": "FIBER_AGENT_EPOCH", "value": epoch} in first["env"]
+
+
 def test_the_init_container_gets_no_variable_or_volume_that_tasks_can_write() -> None:
     """Each of these makes Python, its loader or its shell run code from the shared volume."""
     names_of_code = ("PYTHONPATH", "PYTHONHOME", "HOME", "PATH", "LD_PRELOAD", "BASH_ENV")

@@ -338,11 +338,13 @@ def _add_identity_container(pool: FiberPool, spec: dict[str, Any], worker: dict[
         {"name": names.CREDENTIALS_VOLUME, "emptyDir": {"medium": "Memory", "sizeLimit": "1Mi"}},
     ]
     mount = {"name": names.CREDENTIALS_VOLUME, "mountPath": names.CREDENTIALS_DIRECTORY}
-    spec["initContainers"] = [_identity_container(worker, mount), *first]
+    spec["initContainers"] = [_identity_container(pool, worker, mount), *first]
     worker["volumeMounts"] = [*mounts, mount]
 
 
-def _identity_container(worker: Mapping[str, Any], written: Mapping[str, Any]) -> dict[str, Any]:
+def _identity_container(
+    pool: FiberPool, worker: Mapping[str, Any], written: Mapping[str, Any]
+) -> dict[str, Any]:
     made = {k: copy.deepcopy(worker[k]) for k in _LIKE_THE_WORKER if worker.get(k) is not None}
     made["name"] = names.IDENTITY_CONTAINER
     if not _runs_the_agent(worker):
@@ -358,10 +360,16 @@ def _identity_container(worker: Mapping[str, Any], written: Mapping[str, Any]) -
     made["env"] = [
         {"name": names.ENV_KEY, "value": names.KEY_DIRECTORY},
         {"name": names.ENV_CREDENTIALS, "value": _CREDENTIALS},
+        {"name": names.ENV_EPOCH, "value": str(_highest_epoch(pool))},
         _of_the_pod(names.ENV_NAME, "metadata.name"),
         _of_the_pod(names.ENV_UID, "metadata.uid"),
     ]
     return made
+
+
+def _highest_epoch(pool: FiberPool) -> int:
+    present = pool.spec.master.epoch if pool.spec.master else 0
+    return max(present, pool.status.master_epoch or 0)
 
 
 def _mounts_of_the_interpreter(

@@ -30,7 +30,7 @@ from fiber._hub.hub import Hub
 from fiber._transport.authentication import Identity
 from fiber._transport.channels import naming_the_limit
 from fiber._transport.credentials import Credentials
-from fiber._transport.dialer import AgentDialer
+from fiber._transport.dialer import AgentDialer, EarlierMaster
 from fiber._transport.link import Link
 from fiber._transport.loop import Loop
 from fiber.errors import AuthenticationError, ConfigError, FiberError, LinkError
@@ -211,6 +211,10 @@ class Main:
             self._status = 1
         elif self._waits_until is None or self._timeout():
             # The master answered and refused: it is ending, or took the name for another agent's.
+            if isinstance(error, EarlierMaster) and self._waits_until is None:
+                # A past master may have claimed an epoch above that of all later ones.  The next
+                # pod gets its epoch from the operator.
+                self._environment[_WAITS_UNTIL] = str(time.monotonic() + self._lost_grace)
             self._again = True
             self._loop.call_later(_REFUSED_PAUSE, self._loop.stop)
             return

@@ -34,7 +34,8 @@ class Credentials:
     """Fingerprint of the only master that this agent may have; empty in a warm pool, where masters
     follow one another."""
     epoch: int = 0
-    """Epoch of the latest master that this agent has served.  Earlier masters are refused."""
+    """Lowest epoch of a master that this agent serves: that of the latest one when its pod was
+    made, or of the latest one that it has served."""
 
     @classmethod
     def from_file(cls, path: str | os.PathLike[str]) -> Credentials:

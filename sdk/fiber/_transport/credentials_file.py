@@ -27,6 +27,7 @@ def write(environment: Mapping[str, str]) -> int:
             "uid": uid,
             "key": identity.agent_key(key, name, uid),
             "master": pin.read_text().strip() if pin.exists() else "",
+            "epoch": int(environment.get(names.ENV_EPOCH, 0)),
         }
         _write(environment[names.ENV_CREDENTIALS], json.dumps(values).encode())
         _link_interpreter(Path(environment[names.ENV_CREDENTIALS]).parent)

@@ -58,6 +58,10 @@ class MasterUnreachable(Exception):
     """Error: no master accepted the connection, or it ended before the welcome."""
 
 
+class EarlierMaster(LinkError):
+    """Error: the master came before one that the agent has served, or before the agent's pod."""
+
+
 class AgentDialer:
     """Agent's end of the link: dials the master until it answers or ``timeout`` seconds are over.
 
@@ -212,9 +216,9 @@ class AgentDialer:
             raise fresh(mismatch)
         if isinstance(greeting, MasterWelcome):
             if greeting.epoch < self.epoch:
-                raise LinkError(
-                    f"the master at {self._address} has epoch {greeting.epoch}, and this agent has "
-                    f"served a later one, of epoch {self.epoch}: another program has taken the "
+                raise EarlierMaster(
+                    f"the master at {self._address} has epoch {greeting.epoch}, and this agent "
+                    f"belongs to a later one, of epoch {self.epoch}: another program has taken the "
                     "pool. End the earlier program"
                 )
             return greeting

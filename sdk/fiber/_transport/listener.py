@@ -61,7 +61,7 @@ class MasterListener:
         self._on_unserved = on_unserved
         self._knows = objection
         self.epoch = 0
-        """Number of this master among the masters of the pool.  Used on the loop thread."""
+        """Number of this master among the masters of the pool."""
         self._waiting: dict[tuple[str, str], tuple[PendingConnection, AgentHello]] = {}
         self._by_peer: dict[tuple[str, str], Link] = {}
         self._keepalive = keepalive
@@ -78,6 +78,10 @@ class MasterListener:
             on_refused=lambda reason: loop.call_soon(on_refused, reason),
         )
         self._acceptor.add(self._served)
+
+    def take_epoch(self, epoch: int) -> None:
+        """Tell agents from now on that this master has this epoch.  Any thread."""
+        self.epoch = epoch
 
     def take(self, sock: socket.socket, origin: str) -> None:
         """Serve a connection to an agent that did not come through ``address``."""

@@ -448,9 +448,18 @@ def read_pool_key(
 class WarmPool:
     """FiberPool of another owner, which this program attaches to and detaches from."""
 
-    def __init__(self, api: Api, namespace: str, name: str, master: PoolMaster) -> None:
+    def __init__(
+        self,
+        api: Api,
+        namespace: str,
+        name: str,
+        master: PoolMaster,
+        on_epoch: Callable[[int], None],
+    ) -> None:
+        """``on_epoch`` gets this master's epoch before the pool's agents can dial it."""
         self._api = api
         self._master = master
+        self._on_epoch = on_epoch
         self._attached: AttachedPool | None = None
         self._replicas = 0
         """Replicas of the pool before, which ``detach`` restores."""
@@ -530,6 +539,7 @@ class WarmPool:
         return True
 
     def _as_master(self, found: Body, epoch: int) -> AttachedPool:
+        self._on_epoch(epoch)
         return AttachedPool(self._api, found, self._master, epoch, kept_by_others=True)
 
     def _check_lost(self, found: Body, there: Body) -> None:

@@ -152,7 +152,7 @@ class PoolProvisioner:
             raise self._explained(error, f"attach to the FiberPool {name!r}", name) from error
         credentials = make_credentials(key, self._certificate)
         master, listener = self._listen(name, credentials, loop, observer)
-        attachment = WarmPool(self._api, self.namespace, name, master)
+        attachment = WarmPool(self._api, self.namespace, name, master, listener.take_epoch)
         return PreparedPool(
             listener,
             master.address,
