@@ -6,11 +6,13 @@ import copy
 from collections.abc import Mapping
 from typing import Any
 
+import pytest
+
 from fiber_api.names import LABEL_TEMPLATE_HASH
 from fiber_api.times import format_time
 from fiber_api.v1alpha1 import FiberPool, FiberPoolStatus
-from fiber_operator.planning.manifests import template_hash
-from fiber_operator.planning.plans import Knowledge, Plan
+from fiber_operator.planning.manifests import spec_hash, template_hash
+from fiber_operator.planning.plans import Knowledge, LeaseVerdict, Plan
 from fiber_operator.planning.pods import PodView, observe
 from fiber_operator.planning.reconcile import plan
 
@@ -19,6 +21,8 @@ UID = "11111111-2222-3333-4444-555555555555"
 ADDRESS = "10.96.1.2:7070"
 TEMPLATE = {"spec": {"containers": [{"name": "worker", "image": "registry/worker:1"}]}}
 MASTER = {"host": "10.0.3.7", "port": 41337, "epoch": 1, "identity": "laptop-7:4711"}
+LEASED = {**MASTER, "leaseName": "es", "lostGraceSeconds": 60}
+EXPIRED, UNKNOWN = LeaseVerdict(alive=False), LeaseVerdict(alive=None)
 
 Json = dict[str, Any]
 
@@ -39,6 +43,29 @@ def make_pool(status: Mapping[str, Any] | None = None, **spec: Any) -> FiberPool
     return FiberPool.read(pool_document(status, **spec))
 
 
+def proven(pool: FiberPool, **status: Any) -> Json:
+    """Return the status of a pool of whose template a worker was Ready."""
+    failures = {"specHash": spec_hash(pool), **status.pop("failures", {})}
+    return {"provenTemplateHash": template_hash(pool), "failures": failures, **status}
+
+
+def tried(status: Mapping[str, Any] | None = None, **spec: Any) -> FiberPool:
+    """Return a pool whose template is known to work."""
+    return make_pool(proven(make_pool(**spec), **(status or {})), **spec)
+
+
+def lost(ago: float, **spec: Any) -> FiberPool:
+    """Return a pool as the operator left it when it found the master's Lease expired."""
+    alive = {"type": "MasterAlive", "status": "False", "lastTransitionTime": format_time(NOW - ago)}
+    return tried({"conditions": [alive], "masterEpoch": 1}, **{"master": LEASED, **spec})
+
+
+def edited(pool: FiberPool, **spec: Any) -> FiberPool:
+    """Return the pool with these fields in its spec."""
+    document = pool.model_dump(mode="json", by_alias=True)
+    return FiberPool.read({**document, "spec": {**document["spec"], **spec}})
+
+
 def with_plan(pool: FiberPool, plan: Plan) -> FiberPool:
     """The pool after the plan's status was written."""
     if plan.status is None:
@@ -55,6 +82,11 @@ def knowledge_of(pool: FiberPool, **fields: Any) -> Knowledge:
 def name_of(number: int) -> str:
     """The name of a worker."""
     return f"es-{number:010x}"
+
+
+def names(*numbers: int) -> list[str]:
+    """Return the names of workers."""
+    return [name_of(number) for number in numbers]
 
 
 def pod_document(number: int = 1, *, age: float = 0.0, template: str = "", **status: Any) -> Json:
@@ -154,6 +186,11 @@ def of_template(hash_: str, document: Json) -> Json:
     return document
 
 
+def outdated(*documents: Json) -> list[Json]:
+    """Return the same pods, made of an older template."""
+    return [of_template("older", document) for document in documents]
+
+
 def views(pool: FiberPool, *documents: Json) -> list[PodView]:
     """Return the operator's view; pods without a template have the pool's."""
     current = template_hash(pool)
@@ -171,6 +208,24 @@ def views(pool: FiberPool, *documents: Json) -> list[PodView]:
 def plan_of(pool: FiberPool, *pods: Json, now: float = NOW, **knowledge: Any) -> Plan:
     """Return the plan for the pool with these pods; further arguments are the operator's memory."""
     return plan(pool, views(pool, *pods), knowledge_of(pool, **knowledge), now)
+
+
+def work_of(made: Plan) -> str:
+    """Return the work of a plan: ``-6* -5* +2 ScaledDown`` deletes two pods and creates two.
+
+    A pod with a star is deleted only if it is unchanged.
+    """
+    deletions = [
+        f"-{int(deletion.name.removeprefix('es-'), 16)}{'*' * bool(deletion.resource_version)}"
+        for deletion in made.delete
+    ]
+    words = [*deletions, f"+{made.create}", *sorted({str(d.reason) for d in made.delete})]
+    return " ".join([*words, *["pool"] * made.delete_pool, *["trial"] * made.dry_run])
+
+
+def row(name: str, work: str, pool: FiberPool, *pods: Json, **known: Any) -> Any:
+    """Return the parameters of a test: the pool, its pods, what the operator knows, the work."""
+    return pytest.param(pool, pods, known, work, id=name)
 
 
 def status_of(pool: FiberPool, *pods: Json, **more: Any) -> FiberPoolStatus:

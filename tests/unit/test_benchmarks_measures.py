@@ -95,7 +95,7 @@ def test_rounds_are_as_many_as_the_case_says_and_look_at_the_machine(
 
 def test_a_message_that_memory_has_no_room_for_is_not_sent(monkeypatch: pytest.MonkeyPatch) -> None:
     memory = {"SC_PHYS_PAGES": 2 << 20, "SC_PAGE_SIZE": 4096}
-    monkeypatch.setattr(large_messages.os, "sysconf", memory.__getitem__)
+    monkeypatch.setattr("os.sysconf", memory.__getitem__)
     cases = {case.name: case for case in large_messages.cases(1.0)}
     assert list(cases) == large_messages.CASES
     assert not cases["2 GB, Pipe"].not_run
