@@ -209,10 +209,17 @@ def test_a_plan_has_this_work(pool: FiberPool, pods: list[Json], known: Json, wo
     assert all(deletion.uid == f"uid-{int(deletion.name[3:], 16)}" for deletion in made.delete)
 
 
-def test_a_refusal_is_tried_again_after_a_while() -> None:
-    requeue_at = plan_of(THREE, refusal=FULL).requeue_at
+@pytest.mark.parametrize(
+    ("refusal", "earliest", "latest"),
+    [(FULL, 25, 30), (replace(FULL, count=5, lacks_account=True), 0, 1)],
+    ids=["quota", "account"],
+)
+def test_a_refusal_is_tried_again_after_a_while(
+    refusal: PodRefusal, earliest: float, latest: float
+) -> None:
+    requeue_at = plan_of(THREE, refusal=refusal).requeue_at
     assert requeue_at is not None
-    assert NOW + 25 < requeue_at <= NOW + 30
+    assert NOW + earliest < requeue_at <= NOW + latest
 
 
 def test_policy_any_takes_those_that_cost_least() -> None:
