@@ -84,6 +84,8 @@ def updated(strategy: str, **spec: Any) -> FiberPool:
 THREE, NEW = tried(replicas=3), make_pool(replicas=3)
 TAKEN = plans.Obstacle(Reason.NAME_TAKEN, "taken")
 FULL = PodRefusal(template_hash(THREE), 403, "exceeded quota: q", NOW, count=4)
+LOOKED_UP = "error looking up service account team/default: not found"
+NO_ACCOUNT = replace(FULL, message=f'pods "es-1" is forbidden: {LOOKED_UP}', dry_run=True)
 PENDING = [pod_document(5, age=5), pod_document(6, age=2)]
 STARTING = running(4, age=9, ready=False)
 SILENT = ended(4, conditions=[condition("DisruptionTarget", "True")])
@@ -211,7 +213,7 @@ def test_a_plan_has_this_work(pool: FiberPool, pods: list[Json], known: Json, wo
 
 @pytest.mark.parametrize(
     ("refusal", "earliest", "latest"),
-    [(FULL, 25, 30), (replace(FULL, count=5, lacks_account=True), 0, 1)],
+    [(FULL, 25, 30), (NO_ACCOUNT, 0, 1)],
     ids=["quota", "account"],
 )
 def test_a_refusal_is_tried_again_after_a_while(
