@@ -8,9 +8,9 @@
 Processes share no lock.  An item is one message, which the kernel gives to exactly one reader.  If
 a process dies while it waits, no item is lost.  If it dies later, the item that it has taken is.
 
-Ctrl-C in ``put`` leaves the item either put, with its slot taken, or not put, with its slot free.
-There is one exception: if it strikes while the kernel takes the item, the item is in the queue, and
-``put`` raises as if it were not.
+Ctrl-C in ``put`` or ``get`` never costs a slot, so others can always put.  While either waits, it
+costs no item.  If it strikes just as the item moves, an interrupted ``get`` may lose its item, and
+an interrupted ``put`` may have put it.
 
 Differs from multiprocessing: ``put`` pickles the item at once, and not some time later.
 """
@@ -93,21 +93,20 @@ class Queue(Generic[_T]):
             self._on_queue_feeder_error(message, obj)
             return
         payload, buffers, revoke = message
-        placed = False
         taken: list[Any] = []
         try:
-            placed = self._slots.take(timeout if block else 0, taken)
-            if not placed:
+            if not self._slots.take(timeout if block else 0, taken):
                 raise Full
-            self._send(payload, buffers, taken)
-        finally:
-            if taken:  # it was not sent
+            self._send(payload, buffers)
+        except BaseException:
+            if taken:  # the item may be put all the same: a surplus slot is removed later
                 self._slots.give_back()
-            if not placed:
+            else:
                 revoke()
+            raise
 
-    def _send(self, payload: bytes, buffers: list[memoryview], taken: list[Any]) -> None:
-        self._feeder.put(payload, buffers, taken)
+    def _send(self, payload: bytes, buffers: list[memoryview]) -> None:
+        self._feeder.put(payload, buffers)
 
     def get(self, block: bool = True, timeout: float | None = None) -> _T:
         """Return the next item; Empty if none comes within ``timeout`` seconds."""
@@ -199,13 +198,13 @@ class JoinableQueue(Queue[_T]):
         queue, self._unfinished, self._bell = state
         super().__setstate__(queue)
 
-    def _send(self, payload: bytes, buffers: list[memoryview], taken: list[Any]) -> None:
+    def _send(self, payload: bytes, buffers: list[memoryview]) -> None:
         try:
             self._unfinished.add(1)
-            super()._send(payload, buffers, taken)
-        finally:
-            if taken:  # it was not sent
-                self._unfinished.take(0)
+            super()._send(payload, buffers)
+        except BaseException:  # ``join`` would wait for ever for an item that was not put
+            self._unfinished.take(0)
+            raise
 
     def task_done(self) -> None:
         """Note that an item is done; ValueError if all were done before."""

@@ -195,8 +195,8 @@ def test_a_hook_that_raises_does_not_stop_the_feeder(monkeypatch: pytest.MonkeyP
     queue: Any = fiber.Queue()
     outbox: Any = SimpleNamespace(can_try_send=False, post=post)
     feeder = Feeder(queue, outbox, ItemCount(), on_error=hook, close=lambda: None)
-    feeder.put(b"1", [], [])
-    feeder.put(b"2", [], [])
+    feeder.put(b"1", [])
+    feeder.put(b"2", [])
     feeder.close()
     feeder.join()
     assert posted == [b"2"]

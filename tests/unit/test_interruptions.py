@@ -123,8 +123,6 @@ def test_ctrl_c_at_any_step_of_a_put_costs_no_place_and_no_join(
         unfinished = queue._unfinished.value() if make is fiber.JoinableQueue else there
         assert there or not queue.full(), f"its place is lost at step {stop}"
         assert unfinished <= there, f"nobody can join after step {stop}"
-        if fed:
-            assert (unfinished, queue.full()) == (there, bool(there)), f"at step {stop}"
         queue._feeder._unsent.clear()
         return interrupted
 

@@ -206,19 +206,14 @@ class Feeder:
         self._joins: list[util.Finalize] = []
         self._join_cancelled = False
 
-    def put(self, payload: bytes, buffers: list[memoryview], taken: list[Any]) -> None:
-        """Send a message now if no item waits and there is room, otherwise later.
-
-        ``taken`` notes the item's slot.  It is emptied once the feeder is to free the slot.
-        """
+    def put(self, payload: bytes, buffers: list[memoryview]) -> None:
+        """Send a message now if no item waits and there is room, otherwise later."""
         # Read ``_unsent`` first: the feeder sets ``_sending`` before it takes an item out.
         may_send_now = not self._unsent and not self._sending
         if may_send_now and self._outbox.can_try_send and self._send_now(payload, buffers):
-            taken.clear()
             return
         # The caller may change the arrays behind the buffers when ``put`` has returned.
-        taken[:] = None, (payload, packet.kept(buffers))
-        self._unsent.extend(iter(taken.pop, None))  # moved in one step: no handler runs in between
+        self._unsent.append((payload, packet.kept(buffers)))
         self._wake.put(True)
         if self._no_thread:
             self._start_thread()

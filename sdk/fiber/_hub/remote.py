@@ -296,14 +296,10 @@ class RemoteCounter(RemoteObject):
         with self.stream() as stream:
             stream.ask(Op.ADD, n, form=ONE)
 
-    def take(self, timeout: float | None, taken: list[Any] | None = None) -> bool:
+    def take(self, timeout: float | None) -> bool:
         """Lower the count by one once it is above zero; False when ``timeout`` is over."""
         with self.stream() as stream:
-            if stream.ask(Op.TAKE, timeout=timeout).status is not Status.OK:
-                return False
-            if taken is not None:
-                taken.append(1)
-            return True
+            return stream.ask(Op.TAKE, timeout=timeout).status is Status.OK
 
     def claim(self, timeout: float | None, taken: list[Any], claims: Claimant) -> bool:
         """Take one and record it.  If this process dies in between, the hub undoes it."""

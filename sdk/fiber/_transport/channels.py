@@ -75,11 +75,8 @@ class Counter(Protocol):
     def add(self, n: int = 1) -> None:
         """Raise the count and wake the waiters."""
 
-    def take(self, timeout: float | None, taken: list[Any] | None = None) -> bool:
-        """Lower the count by one once it is above zero; False when ``timeout`` is over.
-
-        ``taken`` gets an entry when the count is lowered: an interrupted caller can give it back.
-        """
+    def take(self, timeout: float | None) -> bool:
+        """Lower the count by one once it is above zero; False when ``timeout`` is over."""
 
     def clear(self) -> int:
         """Set the count to zero and return the count before."""
@@ -134,6 +131,7 @@ class SharedCounter(Counter, Protocol):
     def claim(self, timeout: float | None, taken: list[Any], claims: Claimant) -> bool:
         """Take one as ``take`` does, and record it in ``claims``.
 
+        ``taken`` gets an entry when the count is lowered: an interrupted caller can give it back.
         A process that dies in between has not taken one, or has a claim.
         """
 
@@ -365,13 +363,12 @@ class UnixCounter:
         """Raise the count."""
         os.eventfd_write(self._fd, n)
 
-    def take(self, timeout: float | None, taken: list[Any] | None = None) -> bool:
+    def take(self, timeout: float | None) -> bool:
         """Lower the count by one once it is above zero; False when ``timeout`` is over."""
-        noted = [] if taken is None else taken
         deadline = None if timeout is None else time.monotonic() + timeout
         while True:
             try:
-                noted.extend(map(os.eventfd_read, (self._fd,)))  # no handler runs in between
+                os.eventfd_read(self._fd)
                 return True
             except BlockingIOError:
                 left = None if deadline is None else deadline - time.monotonic()
