@@ -122,27 +122,17 @@ def spawning() -> Any:
 
 def dump_process(process: Any, *, same_host: bool) -> tuple[bytes, list[Descriptor]]:
     """Pickle a Process that is being started, with its descriptors on the same host."""
-    try:
-        return _dump_process(process, Spawning(process) if same_host else RemoteSpawning(process))
-    finally:
-        mp_context.set_spawning_popen(None)  # again: an interrupt can skip the first
-
-
-def _dump_process(process: Any, popen: Any) -> tuple[bytes, list[Descriptor]]:
-    fds: list[Descriptor] = popen.fds
+    popen: Any = Spawning(process) if same_host else RemoteSpawning(process)
     try:
         mp_context.set_spawning_popen(popen)
-        return dumps(process, before_retry=popen.forget), fds
+        payload = dumps(process, before_retry=popen.forget)
+        fds, popen.fds = popen.fds, []
+        return payload, fds
     except (*REFUSALS, AttributeError) as error:
-        try:
-            raise _blame_process(process, error) from error
-        finally:
-            fds.clear()
-    except BaseException:
-        fds.clear()  # now: a traceback that is kept would keep them open
-        raise
+        raise _blame_process(process, error) from error
     finally:
         mp_context.set_spawning_popen(None)
+        popen.fds.clear()  # now: a traceback that is kept would keep them open
 
 
 def dump_shared(obj: Any, *, same_host: bool) -> bytes | None:
@@ -201,15 +191,14 @@ def _name_culprit(parts: Mapping[str, Any], whole: str, reason: Exception) -> Un
 
 def _refusal(obj: Any) -> str | None:
     """Return the reason why ``obj`` does not pickle; None if it does."""
-    pickling = handles.begin_pickling()
-    try:
-        dumps(obj)
-    except Exception as error:
-        # The text only: the error would keep the frames of the callers alive, in a cycle.
-        return str(error)
-    finally:
-        pickling.take_back()
-        pickling.done = True
+    with handles.Pickling() as pickling:
+        try:
+            dumps(obj)
+        except Exception as error:
+            # The text only: the error would keep the frames of the callers alive, in a cycle.
+            return str(error)
+        finally:
+            pickling.take_back()
     return None
 
 
@@ -288,26 +277,14 @@ def encode(obj: Any) -> tuple[bytes, list[memoryview]]:
 
     Connections and queues in it can be unpickled once.
     """
-    pickling = handles.begin_pickling()
-    try:
+    with handles.Pickling():
         return _encode(obj)
-    except BaseException:
-        pickling.take_back()
-        raise
-    finally:
-        pickling.done = True
 
 
 def encode_revocable(obj: Any) -> tuple[bytes, list[memoryview], Callable[[], None]]:
     """Encode an object that may not be sent.  Call the third value in that case."""
-    pickling = handles.begin_pickling()
-    try:
+    with handles.Pickling() as pickling:
         return *_encode(obj), pickling.take_back
-    except BaseException:
-        pickling.take_back()
-        raise
-    finally:
-        pickling.done = True
 
 
 def _encode(obj: Any) -> tuple[bytes, list[memoryview]]:
@@ -327,12 +304,9 @@ def encode_reusable(obj: Any) -> tuple[bytes, list[memoryview], handles.GrantSet
 
     Connections and queues in it can be unpickled for as long as the third value is kept.
     """
-    pickling = handles.begin_pickling(reusable=True)
-    try:
+    with handles.Pickling(reusable=True) as pickling:
         payload, buffers = _encode(obj)
         return payload, buffers, pickling.grants
-    finally:
-        pickling.done = True
 
 
 def dump(obj: Any, file: Any, protocol: int | None = None) -> None:

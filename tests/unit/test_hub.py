@@ -17,7 +17,6 @@ import pytest
 
 import fiber
 from census import wait_until
-from fiber import reduction
 from fiber._hub import client, handles, protocol
 from fiber._hub.client import HubStream, NoHub, ObjectUnreachable
 from fiber._hub.handles import collecting_grants
@@ -102,33 +101,12 @@ def test_an_empty_collection_releases_no_grants(hosts: Hosts) -> None:
     assert not collected
 
 
-def test_a_pickling_that_was_interrupted_before_it_could_end_is_forgotten(hosts: Hosts) -> None:
-    handles.begin_pickling(reusable=True)
-    with hosts.at("a") as hub:
-        one, other = fiber.Pipe()
-        data = pickle.dumps(other)
-        other.close()
-        pickle.loads(data).close()
-        assert objects_kept(hub) == 0, "the handle worked once"
-        one.close()
-
-
-def test_picklings_without_handles_are_forgotten() -> None:
-    for number in range(100):
-        reduction.encode_reusable(number)
-    assert len(handles._this_thread.picklings) <= 1
-
-
 def test_a_pickling_that_failed_leaves_no_grant(hosts: Hosts) -> None:
     with hosts.at("a") as hub:
         one, other = fiber.Pipe()
         kept = pickle.dumps(one)
-        pickling = handles.begin_pickling()
-        with pytest.raises(Exception, match="pickle"):
+        with pytest.raises(Exception, match="pickle"), handles.Pickling():
             pickle.dumps([other, threading.Lock()])
-        assert objects_kept(hub) == 2
-        pickling.take_back()
-        pickling.done = True
         assert objects_kept(hub) == 1
         pickle.loads(kept)
 
@@ -439,9 +417,6 @@ def test_a_child_takes_back_its_collected_grants(hosts: Hosts) -> None:
 def test_a_child_takes_back_grants_of_a_failed_pickling(hosts: Hosts) -> None:
     with hosts.child_at("a") as hub:
         _, end = fiber.Pipe()
-        pickling = handles.begin_pickling()
-        with pytest.raises(Exception, match="pickle"):
+        with pytest.raises(Exception, match="pickle"), handles.Pickling():
             pickle.dumps([end, threading.Lock()])
-        pickling.take_back()
-        pickling.done = True
         assert wait_until(lambda: objects_kept(hub) == 0, PATIENCE)

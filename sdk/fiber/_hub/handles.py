@@ -16,11 +16,10 @@ import contextlib
 import copyreg
 import os
 import threading
-import weakref
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from multiprocessing import context as mp_context
-from typing import Any, NamedTuple, Protocol, TypeAlias
+from typing import Any, NamedTuple, Protocol, Self, TypeAlias
 
 from fiber._hub import client
 from fiber._hub.client import HubStream, ObjectUnreachable
@@ -372,19 +371,27 @@ def _release_remote(end: RemoteObject, grant: bytes) -> None:
 
 
 class Pickling:
-    """Pickling of an object: it gives grants to handles, and ends them if it fails.
+    """Pickling of an object on this thread: it gives grants to handles, and ends them if it fails.
 
-    It is the thread's current pickling until it is ``done`` or forgotten.  So an interrupted
-    pickling leaves no trace.
+    Within ``with``, handles that are pickled on this thread work once, or, if ``reusable``, until
+    ``grants`` are released.  A signal's handler may pickle in the middle of another pickling.
     """
 
-    __slots__ = ("__weakref__", "done", "grants", "reusable", "undo")
+    __slots__ = ("_outer", "grants", "reusable", "undo")
 
-    def __init__(self, reusable: bool) -> None:
+    def __init__(self, *, reusable: bool = False) -> None:
         self.reusable = reusable
         self.grants: GrantSet | None = None
         self.undo: list[Callable[[], None]] = []
-        self.done = False
+
+    def __enter__(self) -> Self:
+        self._outer, _this_thread.pickling = _this_thread.pickling, self
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        _this_thread.pickling = self._outer
+        if kind is not None:
+            self.take_back()
 
     def take_back(self) -> None:
         """End the grants of a pickling that failed."""
@@ -410,56 +417,28 @@ def ring_doorbell() -> None:
 
 
 class _ThisThread(threading.local):
-    """Picklings of this thread, the innermost last."""
-
-    def __init__(self) -> None:
-        self.picklings: list[weakref.ref[Pickling]] = []
+    pickling: Pickling | None = None
 
 
 _this_thread = _ThisThread()
 _single_use = _SingleUse()
 
 
-def begin_pickling(*, reusable: bool = False) -> Pickling:
-    """Begin a pickling on this thread, and return it.
-
-    Until it is ``done``, handles that are pickled on this thread work once, or, if ``reusable``,
-    until its ``grants`` are released.  A signal's handler may begin one in the middle of another,
-    which then goes on.
-    """
-    pickling = Pickling(reusable)
-    _current()  # forgets picklings that are done, as no other call may ever do that
-    _this_thread.picklings.append(weakref.ref(pickling))
-    return pickling
-
-
-def _current() -> Pickling | None:
-    picklings = _this_thread.picklings
-    while picklings:
-        pickling = picklings[-1]()
-        if pickling is not None and not pickling.done:
-            return pickling
-        picklings.pop()
-    return None
-
-
 def undo_pickling() -> None:
     """End the grants of the current pickling, which begins again in another way."""
-    pickling = _current()
-    if pickling is not None:
-        pickling.take_back()
+    if _this_thread.pickling is not None:
+        _this_thread.pickling.take_back()
 
 
 def _undo_by(step: Callable[[], None]) -> None:
     """Note how to end a grant if the current pickling fails."""
-    pickling = _current()
-    if pickling is not None:
-        pickling.undo.append(step)
+    if _this_thread.pickling is not None:
+        _this_thread.pickling.undo.append(step)
 
 
 def _grants() -> GrantSet | _SingleUse:
     """Return the source of grants for the handle that is being pickled."""
-    pickling = _current()
+    pickling = _this_thread.pickling
     if pickling is None:
         return _single_use
     if pickling.reusable and pickling.grants is None:
@@ -485,15 +464,9 @@ def collecting_grants(*, reusable: bool = True) -> Iterator[GrantSet]:
     The handles work until the set is released.  If the block raises, it is released.  Without
     ``reusable`` each handle works once.
     """
-    pickling = begin_pickling(reusable=reusable)
-    pickling.grants = grants = GrantSet(reusable=reusable)
-    try:
-        yield grants
-    except BaseException:
-        grants.release()
-        raise
-    finally:
-        pickling.done = True
+    with Pickling(reusable=reusable) as pickling:
+        pickling.grants = GrantSet(reusable=reusable)
+        yield pickling.grants
 
 
 def _reduce_channel(end: Any) -> tuple[Any, ...]:
