@@ -36,7 +36,7 @@ from fiber._agent import child
 from fiber._hub import handles
 from fiber._hub.heap import Segment
 from fiber._wire import packet
-from fiber._wire.descriptor import Descriptor, opened
+from fiber._wire.descriptor import Descriptor, own
 from fiber.errors import UnpicklableError
 
 __all__ = [
@@ -105,7 +105,7 @@ class Spawning:
 
     def duplicate_for_child(self, fd: int) -> int:
         """Send ``fd`` along; return the index under which the child finds it."""
-        self.fds.append(opened(os.dup, fd))
+        self.fds.append(own(os.dup(fd)))
         return len(self.fds) - 1
 
     def forget(self) -> None:

@@ -322,7 +322,7 @@ def test_a_zygote_that_cannot_be_launched_is_an_error_of_the_start(
     with monkeypatch.context() as broken:
         broken.setattr(zygote_process, "launch", refuse)
         with pytest.raises(FileNotFoundError, match="no interpreter"):
-            begin(own, os._exit, 0, tasks=True, fds=(descriptor.opened(os.dup, 1),))
+            begin(own, os._exit, 0, tasks=True, fds=(descriptor.own(os.dup(1)),))
     settled(own.loop)
     assert len(os.listdir("/proc/self/fd")) == before
     _, observer = begin(own, os._exit, 0)
@@ -332,7 +332,7 @@ def test_a_zygote_that_cannot_be_launched_is_an_error_of_the_start(
 @pytest.mark.parametrize("spare", range(6))
 def test_no_descriptor_left_is_a_clear_error_and_leaks_none(shared: Agent, spare: int) -> None:
     begin(shared, os._exit, 0)[1].wait_for_exit()  # its zygote runs
-    handed = descriptor.opened(os.dup, 1)
+    handed = descriptor.own(os.dup(1))
     before = len(os.listdir("/proc/self/fd"))
     slots = len(shared.progress_table._free)
     with few_descriptors(spare), pytest.raises(TooManyOpenFiles, match="ulimit -n"):

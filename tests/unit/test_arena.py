@@ -14,7 +14,7 @@ import pytest
 
 from census import wait_until
 from fiber._wire import memory_files
-from fiber._wire.descriptor import opened, own
+from fiber._wire.descriptor import own
 from fiber._wire.memory_files import (
     BORROWED_BLOCKS,
     DATA_OFFSET,
@@ -209,7 +209,7 @@ def test_a_block_without_memory_leaves_no_descriptor(monkeypatch: pytest.MonkeyP
 
 def test_much_memory_is_given_back_by_a_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory_files, "SLOWLY", 1 << 16)
-    owner = opened(os.memfd_create, "message")
+    owner = own(os.memfd_create("message"))
     os.ftruncate(owner.fileno(), 1 << 16)
     part = memoryview(mapping(owner, 1 << 16))[10:20]
     part[:] = b"0123456789"
@@ -230,7 +230,7 @@ def test_where_no_thread_can_be_started_memory_is_given_back_at_once(
 
     monkeypatch.setattr(memory_files, "SLOWLY", 1 << 16)
     monkeypatch.setattr(threading.Thread, "start", refuse)
-    owner = opened(os.memfd_create, "message")
+    owner = own(os.memfd_create("message"))
     os.ftruncate(owner.fileno(), 1 << 16)
     kept = weakref.ref(mapping(owner, 1 << 16))
     assert kept() is None
@@ -239,10 +239,10 @@ def test_where_no_thread_can_be_started_memory_is_given_back_at_once(
 KEPT_TO_THE_END = """
 import os
 from fiber._wire import memory_files
-from fiber._wire.descriptor import opened
+from fiber._wire.descriptor import own
 
 memory_files.SLOWLY = 1 << 16
-owner = opened(os.memfd_create, "message")
+owner = own(os.memfd_create("message"))
 os.ftruncate(owner.fileno(), 1 << 16)
 kept = memory_files.mapping(owner, 1 << 16)
 """

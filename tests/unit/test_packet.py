@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fiber._wire import memory_files, packet
-from fiber._wire.descriptor import opened
+from fiber._wire.descriptor import own
 from fiber._wire.memory_files import RETAINED_LIMIT
 from fiber._wire.packet import BULK, INLINE_LIMIT
 from fiber.errors import TooManyOpenFiles
@@ -324,7 +324,7 @@ def test_a_copy_without_the_interpreter_lock_is_equal_to_its_source(size: int) -
 
 def test_a_copy_of_a_mapped_message_is_read_from_its_file(monkeypatch: pytest.MonkeyPatch) -> None:
     size = 33 << 20
-    file = opened(os.memfd_create, "message")
+    file = own(os.memfd_create("message"))
     os.pwrite(file.fileno(), b"header" + os.urandom(size), 0)
     mapped = memory_files.mapping(file, 6 + size)
     expected = bytes(mapped[6:])

@@ -47,7 +47,7 @@ from fiber._hub.protocol import (
 from fiber._hub.registry import NoSuchObject, Registry
 from fiber._hub.remote import RemoteChannel, RemoteCounter, RemoteEnd, RemoteObject
 from fiber._transport.channels import SharedChannel, SharedCounter, UnixChannel, UnixCounter
-from fiber._wire.descriptor import Descriptor, opened, own
+from fiber._wire.descriptor import Descriptor, own
 
 
 class DescriptorHandle(Protocol):
@@ -199,7 +199,7 @@ def _inherited_segment(spawning: Any, block: Block) -> DescriptorHandle:
         return segment
     # multiprocessing's Process takes each descriptor once, and closes it in the child.  It keeps
     # the duplicate until the child has started.
-    duplicate = opened(os.dup, block.segment.fileno())
+    duplicate = own(os.dup(block.segment.fileno()))
     vars(spawning).setdefault("_fiber_duplicates", []).append(duplicate)
     return _inherited(spawning, duplicate.fileno())
 

@@ -22,7 +22,7 @@ from collections import deque
 from typing import Any
 
 from fiber._transport.channels import naming_the_limit
-from fiber._wire.descriptor import Descriptor, opened
+from fiber._wire.descriptor import Descriptor, own
 
 SEGMENT = 1 << 20
 """Bytes of a segment that small blocks share.  Pages that are never written take no memory."""
@@ -173,7 +173,7 @@ def block_of(owner: Descriptor, offset: int, size: int) -> Block:
 
 def _new_segment(name: str, size: int) -> Segment:
     with naming_the_limit("sharing memory"):
-        owner = opened(os.memfd_create, name, os.MFD_CLOEXEC)
+        owner = own(os.memfd_create(name, os.MFD_CLOEXEC))
         os.ftruncate(owner.fileno(), size)
         return _mapped(owner)
 

@@ -27,7 +27,7 @@ from fiber._hub.hosted import (
 )
 from fiber._hub.protocol import NO_SECRET, SECRET_BYTES, WHOLE, Extent, ObjectKind
 from fiber._transport.channels import naming_the_limit
-from fiber._wire.descriptor import Descriptor, opened
+from fiber._wire.descriptor import Descriptor, own
 
 Hosted: TypeAlias = HostedChannel | HostedCounter | HostedMemory | HostedSemaphore | HostedWaitList
 
@@ -145,7 +145,7 @@ class Registry:
         if shared is None:
             identity = NO_SECRET if kind in _WITHOUT_IDENTITY else self._identify(known)
             with naming_the_limit("sharing a pipe or queue with another process"):
-                kept = [opened(os.dup, number) for number in (fd, *beside)]
+                kept = [own(os.dup(number)) for number in (fd, *beside)]
                 shared = SharedObject(kind, kept, extent, identity)
             self._objects[known] = shared
         grant = os.urandom(SECRET_BYTES)

@@ -10,7 +10,6 @@ objects: sockets and eventfds, shared by descriptor (``UnixChannel`` and ``UnixC
 
 from __future__ import annotations
 
-import _socket
 import errno
 import functools
 import os
@@ -23,7 +22,7 @@ from typing import Any, Protocol, Self
 
 from fiber._transport.loop import LONGEST_POLL, Loop
 from fiber._wire import packet
-from fiber._wire.descriptor import Descriptor, opened, opened_pair, own
+from fiber._wire.descriptor import Descriptor, own
 from fiber._wire.memory_files import BytesLike
 from fiber._wire.packet import Message
 from fiber.errors import FiberError, FileTooLarge, TooManyOpenFiles
@@ -174,9 +173,8 @@ def socketpair(doing: str) -> tuple[socket.socket, socket.socket]:
 
 def connected() -> tuple[Descriptor, Descriptor]:
     """Open two connected packet sockets, and return their owners."""
-    with naming_the_limit("opening a pipe"):
-        # socket.socketpair() is several steps, with the descriptors in between as numbers.
-        return opened_pair(_socket.socketpair, socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    one, other = socketpair("opening a pipe")
+    return own(one.detach()), own(other.detach())
 
 
 def _block(sock: socket.socket) -> None:
@@ -352,7 +350,7 @@ class UnixCounter:
     def create(cls, value: int = 0) -> Self:
         """Return a new counter that starts at ``value``."""
         with naming_the_limit("making a counter"):
-            return cls(opened(os.eventfd, value, _COUNTER))
+            return cls(own(os.eventfd(value, _COUNTER)))
 
     @classmethod
     def from_fd(cls, fd: int) -> Self:

@@ -20,7 +20,7 @@ from functools import partial
 from typing import Any, Protocol
 
 from fiber._exceptions import fresh, report_uncaught
-from fiber._wire.descriptor import opened
+from fiber._wire.descriptor import own
 from fiber.errors import FiberError
 
 Callback = Callable[[], object]
@@ -108,7 +108,7 @@ class Wakeup:
     __slots__ = ("_owner", "fd")
 
     def __init__(self) -> None:
-        self._owner = opened(os.eventfd, 0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        self._owner = own(os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK))
         self.fd = self._owner.fileno()
 
     def set(self) -> None:

@@ -28,7 +28,7 @@ from collections.abc import Iterable
 from ctypes import pythonapi
 from typing import TypeAlias
 
-from fiber._wire.descriptor import Descriptor, opened, own
+from fiber._wire.descriptor import Descriptor, own
 from fiber.errors import TooManyOpenFiles
 
 BytesLike: TypeAlias = bytes | bytearray | memoryview
@@ -65,7 +65,7 @@ class MessageBlock:
     def __init__(self, capacity: int) -> None:
         self.capacity = capacity
         flags = os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING
-        self._owner = opened(os.memfd_create, "fiber-message", flags)
+        self._owner = own(os.memfd_create("fiber-message", flags))
         self.fd = self._owner.fileno()
         # A reader that maps the content relies on the file's size.
         fcntl.fcntl(self.fd, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK)
@@ -307,7 +307,7 @@ def _frame_memory(size: int, passed_on: bool) -> FrameMemory:
         return _private_memory(total)
     try:
         flags = os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING
-        owner = opened(os.memfd_create, "fiber-frame", flags)
+        owner = own(os.memfd_create("fiber-frame", flags))
         os.ftruncate(owner.fileno(), total)
         fcntl.fcntl(owner.fileno(), fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK)  # as in a block
         memory = FrameMemory(owner.fileno(), total)
@@ -366,7 +366,7 @@ class Blob:
     def fileno(self) -> int:
         """Return the descriptor of a file that holds the bytes.  This object keeps it."""
         if self._file is None:
-            file = opened(os.memfd_create, "fiber-blob")
+            file = own(os.memfd_create("fiber-blob"))
             _write_all(file.fileno(), self.data)
             self._file = file
         return self._file.fileno()

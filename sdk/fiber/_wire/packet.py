@@ -26,9 +26,8 @@ import pickle
 import socket
 import struct
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
-from itertools import starmap
 from operator import is_not
 from typing import Any, TypeAlias
 
@@ -90,20 +89,21 @@ _ANCILLARY_ONE = socket.CMSG_SPACE(_FD.size)
 
 _CALL: Callable[[Callable[[], Any]], Any] = operator.call
 _Ancillary: TypeAlias = list[tuple[int, int, bytes]]
-_Call: TypeAlias = tuple[tuple[tuple[bytearray], int, int]]
-_Received: TypeAlias = list[Any]
-"""Result of ``recvmsg_into``; then, of a large message, the owner of its memory."""
+_Arguments: TypeAlias = tuple[tuple[bytearray], int, int]
+"""Arguments of ``recvmsg_into``."""
+_Received: TypeAlias = tuple[int, _Ancillary, int, Any]
+"""Result of ``recvmsg_into``."""
 
 
 class _ReceiveBuffer:
     """Memory to receive a packet into, and the arguments of ``recvmsg_into`` for it."""
 
-    __slots__ = ("call", "data", "view")
+    __slots__ = ("arguments", "data", "view")
 
     def __init__(self) -> None:
         self.data = bytearray(_RECEIVE)
         self.view = memoryview(self.data)
-        self.call = (((self.data,), _ANCILLARY_ONE, _CLOEXEC),)
+        self.arguments = ((self.data,), _ANCILLARY_ONE, _CLOEXEC)
 
 
 class WakeUp(Exception):
@@ -390,18 +390,18 @@ def receive_object(sock: socket.socket) -> Any:
     """
     free = _buffers.free
     buffer = free.pop() if free else _ReceiveBuffer()
-    ours = True
     try:
-        try:
-            received = _recvmsg(sock, buffer.data, buffer.call)
-        except BlockingIOError as error:
+        received = _recvmsg(sock, buffer.arguments)
+    except OSError as error:
+        free.append(buffer)
+        if isinstance(error, BlockingIOError):
             raise NothingYet(*error.args) from None
-        size = received[0][0]
-        if size and not buffer.data[0]:
+        raise
+    size = received[0]
+    if size and not buffer.data[0]:
+        try:
             return pickle.loads(buffer.view[1:size])
-        ours = False
-    finally:
-        if ours:
+        finally:
             free.append(buffer)
     return loads(_receive_parts(buffer, received))
 
@@ -427,12 +427,12 @@ def receive(
     free = _buffers.free
     buffer = free.pop() if free else _ReceiveBuffer()
     try:
-        call = (((buffer.data,), space, _CLOEXEC if wait else _DONTWAIT),)
-        received = _recvmsg(sock, buffer.data, call, then)
-    except BaseException:
+        flags = _CLOEXEC if wait else _DONTWAIT
+        received = _recvmsg(sock, ((buffer.data,), space, flags), then)
+    except OSError:
         free.append(buffer)
         raise
-    size = received[0][0]
+    size = received[0]
     if size and not buffer.data[0]:
         if size > INLINE_LIMIT + 1:  # ``tobytes`` would take it for separate memory
             free.append(buffer)
@@ -442,38 +442,26 @@ def receive(
 
 
 def _recvmsg(
-    sock: socket.socket,
-    data: bytearray,
-    call: _Call,
-    then: Callable[[], None] | None = None,
+    sock: socket.socket, arguments: _Arguments, then: Callable[[], None] | None = None
 ) -> _Received:
-    received: _Received = []
     try:
-        # Receive and note it in one step: between steps a signal's handler could lose descriptors.
-        try:
-            received.extend(
-                _receiving(sock, call, then) if then else starmap(sock.recvmsg_into, call)
-            )
-        except ConnectionResetError:
-            # The peer closed before it had read all packets of this side.  The kernel reports that
-            # once, before it delivers the peer's packets.  The next call returns these, or the end.
-            received.extend(_receiving(sock, call, then))
-        ancillary = received[0][1]
-        if ancillary and data[0] in (PARTS_IN_MEMFD, PASSED, WAKE_UP):
-            received.extend(map(own, _rights(ancillary)[:1]))
-        return received
-    except BaseException:
-        for fd in _rights(received[0][1])[len(received) - 1 :] if received else ():
-            os.close(fd)
-        raise
+        return _recvmsg_once(sock, arguments, then)
+    except ConnectionResetError:
+        # The peer closed before it had read all packets of this side.  The kernel reports that
+        # once, before it delivers the peer's packets.  The next call returns these, or the end.
+        return _recvmsg_once(sock, arguments, then)
 
 
-def _receiving(sock: socket.socket, call: _Call, then: Callable[[], None] | None) -> Iterator[Any]:
+def _recvmsg_once(
+    sock: socket.socket, arguments: _Arguments, then: Callable[[], None] | None
+) -> _Received:
     if then is None:
-        return starmap(sock.recvmsg_into, call)
-    steps: tuple[Callable[[], Any], ...] = partial(sock.recvmsg_into, *call[0]), then
-    results: map[Any] = map(_CALL, steps)
-    return filter(None, results)
+        return sock.recvmsg_into(*arguments)
+    # Both calls are one step of the interpreter: no signal's handler runs in between.
+    steps: list[Callable[[], Any]] = [partial(sock.recvmsg_into, *arguments), then]
+    received: _Received
+    received, _ = map(_CALL, steps)
+    return received
 
 
 def _rights(ancillary: _Ancillary) -> list[int]:
@@ -489,9 +477,9 @@ def _rights(ancillary: _Ancillary) -> list[int]:
 def _receive_parts(
     buffer: _ReceiveBuffer, received: _Received, *, passing: bool = False
 ) -> Message:
-    (size, ancillary, flags, _), *memory = received
+    size, ancillary, flags, _ = received
     view = buffer.view
-    message = Message(view[:0], [], _rights(ancillary)[len(memory) :], buffer)
+    message = Message(view[:0], [], _rights(ancillary), buffer)
     try:
         if not size:
             raise ConnectionClosed()
@@ -499,17 +487,19 @@ def _receive_parts(
             # The sender attached descriptors, and this process may open no more files.
             raise TooManyOpenFiles("receiving a descriptor")
         kind, count, length = _PARTS.unpack_from(view)
-        if kind == WAKE_UP and memory:
-            raise WakeUp(memory[0])
+        has_memory = kind in (PARTS_IN_MEMFD, PASSED, WAKE_UP) and message.fds
+        memory = own(message.fds.pop(0)) if has_memory else None
+        if kind == WAKE_UP and memory is not None:
+            raise WakeUp(memory)
         offset = _PARTS.size + _SIZE.size * count
         sizes = [length, *(n for (n,) in _SIZE.iter_unpack(view[_PARTS.size : offset]))]
         if kind == PARTS:
             return _inline_parts(view[offset:size], sizes, message)
-        if not memory:
+        if memory is None:
             raise ValueError("a large message without its memory")
         if kind == PASSED:
-            return _passed_parts(view[offset:size], sizes, message, memory[0])
-        return _memory_parts(sizes, message, memory[0], passing=passing)
+            return _passed_parts(view[offset:size], sizes, message, memory)
+        return _memory_parts(sizes, message, memory, passing=passing)
     except BaseException:
         message.close_descriptors()
         message.release()
