@@ -1,4 +1,4 @@
-"""Renders the chart as Helm does: what a cluster would get for these values."""
+"""Renders the chart as Helm does: the objects that a cluster would get for these values."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ DEFAULTS: Values = {}
 
 
 class Refused(Exception):
-    """Helm did not render or accept the chart; the message is what a person reads."""
+    """Error of Helm, which did not render or accept the chart.  It has Helm's message."""
 
 
 def find_helm() -> str | None:

@@ -1,4 +1,4 @@
-"""The policy that bounds what templates of FiberPools ask for."""
+"""The admission policy that bounds the templates of FiberPools."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LAB = "system:serviceaccount:lab:"
 
 
 def refusals(policy: Manifest, template: Body, user: str = ALICE) -> list[str]:
-    """Return what the policy says of a new pool in the namespace ``lab``; empty: it may be made."""
+    """Return the policy's messages about a new pool in namespace ``lab``; empty: it is allowed."""
     request = {"operation": "CREATE", "namespace": "lab", "userInfo": {"username": user}}
     known: Body = {"object": {"spec": {"template": template}}, "request": request, "variables": {}}
     spec = policy["spec"]

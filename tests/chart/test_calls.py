@@ -77,7 +77,7 @@ async def grows(world: World) -> None:
 
 
 async def loses_workers(world: World) -> None:
-    """Somebody deletes one after the other, which is the same event again."""
+    """A user deletes one after the other, which causes the same event again."""
     for _ in range(2):
         world.store.delete("pods", NAMESPACE, world.names()[0], {})
         await world.settled(PAUSE + 1)

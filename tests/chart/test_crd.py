@@ -28,7 +28,7 @@ def test_the_rendered_resource_type_is_the_generated_one(
 
 
 def test_an_upgrade_updates_the_crd_and_an_uninstall_keeps_it(helm: Helm) -> None:
-    """Helm leaves alone what is in a folder crds, and removes what has no such policy."""
+    """Helm keeps the objects of a folder crds, and removes others without the policy ``keep``."""
     rendered = named(helm.render(), "CustomResourceDefinition")
     assert rendered["metadata"]["annotations"]["helm.sh/resource-policy"] == "keep"
     assert not is_hook(rendered)

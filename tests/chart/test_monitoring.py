@@ -23,7 +23,7 @@ ON: dict[str, Any] = {
         "dashboard": {"create": True},
     }
 }
-# What Prometheus itself adds.
+# Labels and metrics that Prometheus adds.
 TARGET_LABELS = {"namespace", "job", "instance", "le"}
 
 

@@ -1,4 +1,4 @@
-"""Scope of the operator: one switch sets its rights, what it watches, and where it is tested."""
+"""Scope of the operator: one switch sets its rights, its watches and the place of its test."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CLUSTER_WIDE = {"ClusterRole", "ClusterRoleBinding", "CustomResourceDefinition"}
 
 
 def environment(manifests: list[Manifest]) -> dict[str, str]:
-    """The operator's environment; what only a pod knows is "from-the-pod"."""
+    """The operator's environment; a value from the pod's fields is "from-the-pod"."""
     pod = named(manifests, "Deployment")["spec"]["template"]["spec"]
     entries = pod["containers"][0]["env"]
     assert len({entry["name"] for entry in entries}) == len(entries)
@@ -49,7 +49,7 @@ def subject(account: str) -> dict[str, str]:
 
 
 def role_of(manifests: list[Manifest], namespace: str) -> Manifest:
-    """Return what the operator's binding in this namespace ("" for all) refers to."""
+    """Return the roles of the operator's bindings in this namespace ("" for all)."""
     kind = "Role" if namespace else "ClusterRole"
     here = [
         manifest

@@ -4,7 +4,7 @@
 
 where CHECKOUT is CleanRL's repository.  It learns the same CartPole twice, once with each, and says
 whether all that it logs (losses, entropy, explained variance, returns) is the same to the last bit.
-It needs what CleanRL needs: torch and tyro.
+It needs the packages of CleanRL: torch and tyro.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class PrintedScalars:
         """Ignore the text."""
 
     def close(self) -> None:
-        """Do nothing: no file is open."""
+        """Close the writer, which has no open file."""
 
 
 def within(vector_env: str, program: str) -> None:

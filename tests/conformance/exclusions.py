@@ -50,7 +50,7 @@ _ONE_PORT = {
     ),
 }
 
-# Of process pool executors: backend -> id of the test -> reason
+# Exclusions of process pool executors: backend -> id of the test -> reason
 EXECUTORS: dict[str, dict[str, str]] = {
     "local": _EXECUTORS,
     "loopback": {**_EXECUTORS, **_ELSEWHERE},
@@ -60,7 +60,7 @@ EXECUTORS: dict[str, dict[str, str]] = {
 _REGISTERED_HERE = "starts another interpreter, which does not import fiber.joblib"
 _NO_MEMORY_MAPS = "large arrays are in shared memory that has no name, and not in a file"
 
-# Of joblib's tests of a backend: name of the test -> reason
+# Exclusions of joblib's tests of a backend: name of the test -> reason
 JOBLIB: dict[str, str] = {
     "test_parallel_with_interactively_defined_functions": _REGISTERED_HERE,
     "test_parallel_with_unpicklable_functions_in_args": _REGISTERED_HERE,

@@ -27,7 +27,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out what has no backend; what is listed must fail."""
+    """Leave out tests without a backend.  Listed tests must fail."""
     mine = [item for item in items if _backend(item) == BACKEND]
     config.hook.pytest_deselected(items=[item for item in items if item not in mine])
     items[:] = mine

@@ -264,7 +264,7 @@ class _Interpreter:
             try:
                 os.kill(pid, signal.SIGABRT)
             except ProcessLookupError:
-                pass  # ended in the meantime, so it is not what hangs
+                pass  # the process has ended, so it does not hang
         census.wait_until(lambda: process.poll() is not None, 2)
 
     def _left_behind(self, process: subprocess.Popen[bytes]) -> list[census.Found]:
@@ -274,7 +274,7 @@ class _Interpreter:
     def _started(
         self, process: subprocess.Popen[bytes], *, trackers: bool = True
     ) -> list[census.Found]:
-        """Find its processes.  Resource trackers remove what others made, and end after them."""
+        """Find its processes.  Resource trackers, which clean up for others, end after them."""
         found = census.started_by(process.pid, f"{MARKER}={self._marker}")
         return [one for one in found if trackers or TRACKER not in one.command]
 

@@ -1,4 +1,4 @@
-"""Holds outcomes against the list of exclusions and prints what came of it."""
+"""Compares outcomes with the list of exclusions, and prints the difference."""
 
 from __future__ import annotations
 

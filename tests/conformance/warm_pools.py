@@ -30,8 +30,8 @@ from fiber._backends.kubernetes.template import PodShape, fiber_pool_body, pod_t
 from fiber_api import names
 from unit.kubernetes_rig import kubeconfig
 
-PODS = 4  # of each pool
-PROCESSES = 16  # of each pod: no test waits for room
+PODS = 4  # agents of each pool
+PROCESSES = 16  # processes of each pod: no test waits for room
 READY = 180.0  # seconds until all pods of a pool are there: an image may have to be pulled
 _LOOK = 0.05  # seconds between two looks at a pool
 _SUPPORT = ("__init__.py", "_test_multiprocessing.py", "support", "test_concurrent_futures*")
@@ -157,7 +157,7 @@ class WarmPools:
         try:
             self._api.delete(POOLS.path(self._namespace, pool.name))
         except NotFound:
-            pass  # somebody else did
+            pass  # another process deleted it
         if pool.port is not None:
             pool.port.close()
 

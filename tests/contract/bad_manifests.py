@@ -1,4 +1,4 @@
-"""Manifests that break a rule, and what must be read in the refusal.
+"""Manifests that break a rule, and the words that the refusal must have.
 
 Two readers refuse them: the models here, and a real API server in ``tests/e2e``.  A change maps
 paths to new values, ``ABSENT`` for a field to leave out.
@@ -35,7 +35,7 @@ class Bad:
     name: str
     change: Mapping[str, Any]
     words: tuple[str, ...]
-    """Each stands in kubectl's message: the field, and for a rule of ours what to do."""
+    """Words of kubectl's message: the field, and for a rule of Fiber the remedy."""
 
     def manifest(self) -> dict[str, Any]:
         return changed(GOOD, self.change)
@@ -43,7 +43,7 @@ class Bad:
 
 @dataclass(frozen=True)
 class BadUpdate:
-    """A manifest that is good, and a change to it that only somebody who saw it can refuse."""
+    """A valid manifest, and a change that only a rule with access to the old object can refuse."""
 
     name: str
     before: Mapping[str, Any]

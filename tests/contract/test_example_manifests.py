@@ -1,4 +1,4 @@
-"""The manifests under examples/: what they show is what the contract says."""
+"""The manifests under examples/ agree with the contract."""
 
 from __future__ import annotations
 

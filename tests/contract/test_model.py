@@ -1,4 +1,4 @@
-"""Reading resources: strict about types, tolerant of what is new, never surprised."""
+"""Reading of resources: strict about types, tolerant of new fields."""
 
 from __future__ import annotations
 

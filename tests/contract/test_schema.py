@@ -1,4 +1,4 @@
-"""The generated CustomResourceDefinition: what it must say, and what a structural one may."""
+"""The generated CustomResourceDefinition: its contents and the limits of a structural schema."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from fiber_api.v1alpha1 import (
 
 ROOT = Path(__file__).resolve().parents[2]
 
-# What may stand in a node of a structural schema, of all that OpenAPI knows.
+# Keywords of OpenAPI that a node of a structural schema may have.
 ALLOWED = {
     "default",
     "description",
@@ -198,7 +198,7 @@ def test_the_schema_has_at_least_ten_rules() -> None:
 
 
 def test_no_rule_takes_the_optional_of_a_field() -> None:
-    # Of ``self.?field`` the API server knows no length, and refuses the schema as too expensive.
+    # The API server knows no length of ``self.?field``, and refuses the schema as too expensive.
     assert [rule for rule in RULE_IDS if ".?" in rule] == []
 
 

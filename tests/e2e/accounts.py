@@ -36,7 +36,7 @@ def may_read_credentials(scene: Scene, pool: str) -> None:
 
 
 def make_account(scene: Scene, name: str) -> None:
-    """An account that may do nothing."""
+    """An account without rights."""
     scene.kube.create(scene.path("serviceaccounts"), {"metadata": {"name": name}})
 
 

@@ -46,9 +46,9 @@ class NoCluster(Exception):
 
 
 class Cluster:
-    """A cluster with Fiber's images on its nodes, and what tests may do to it.
+    """A cluster with Fiber's images on its nodes, and the operations of tests on it.
 
-    A test that asks for what this kind of cluster cannot do is skipped.
+    A test is skipped if it needs an operation that this kind of cluster does not have.
     """
 
     description: str
@@ -253,7 +253,7 @@ class Kind(Cluster):
 
 
 class Given(Cluster):
-    """Cluster of somebody else, on which the tests remove all that they installed."""
+    """Cluster of the user, from which the tests remove everything that they installed."""
 
     def __init__(self, kubeconfig: Path, environment: Mapping[str, str]) -> None:
         self.description = f"the cluster of {kubeconfig}"
@@ -326,7 +326,7 @@ def _gateway() -> str:
 
 
 def find_program(name: str) -> str:
-    """kubectl or helm: what is on the PATH, else what was built for our cluster."""
+    """kubectl or helm: the one on the PATH, else the one that was built for the test cluster."""
     if found := shutil.which(name) or shutil.which(name, path=places.programs()):
         return found
     build.build(["helm" if name == "helm" else "kubernetes"])

@@ -71,7 +71,7 @@ def release(
     pytestconfig: pytest.Config,
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Iterator[Release]:
-    """The operator for all namespaces, ready; what an earlier session left is removed."""
+    """The operator for all namespaces, ready.  Objects of an earlier session are removed."""
     owner = crd_owner(kube)
     if owner not in (None, f"{RELEASE}/{RELEASE}"):
         pytest.fail(
@@ -83,7 +83,7 @@ def release(
     release = Release(kube, RELEASE, RELEASE, cluster.images, tmp_path_factory.mktemp("helm"))
     uncordon(kube)
     _remove_namespaces(kube)
-    release.uninstall()  # of a session that was killed, perhaps while Helm was at work
+    release.uninstall()  # left by a session that was killed, perhaps while Helm ran
     # The namespace may still be terminating after the last session, and then accepts no objects.
     kube.kubectl("delete", "namespace", RELEASE, "--ignore-not-found", "--timeout=120s")
     release.install()
@@ -138,7 +138,7 @@ def pool(scene: Scene) -> Pool:
 
 @pytest.fixture
 def bare_cluster(cluster: Cluster, release: Release, kube: Kube) -> Iterator[None]:
-    """A cluster that has the images and nothing else of Fiber; then the operator of all tests."""
+    """A cluster that has only Fiber's images; afterwards the operator of all tests."""
     if not cluster.by_version:
         pytest.skip(f"{cluster.description}: its nodes have no images under the chart's version")
     remove_type = ("delete", "--ignore-not-found", "customresourcedefinition", names.CRD_NAME)
@@ -153,7 +153,7 @@ def bare_cluster(cluster: Cluster, release: Release, kube: Kube) -> Iterator[Non
 def programs(scene: Scene, cluster: Cluster, tmp_path: Path) -> Iterator[Programs]:
     """Starts programs that use Fiber, in a namespace where they may use pools."""
     may_use_pools(scene)
-    default = scene.path("serviceaccounts", "default")  # of all workers; it comes a moment later
+    default = scene.path("serviceaccounts", "default")  # all workers use it; it comes later
     scene.wait("the namespace has its account", lambda: scene.kube.get(default), 60.0, poll=0.2)
     programs = Programs(scene, cluster, tmp_path)
     yield programs

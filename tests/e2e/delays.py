@@ -1,4 +1,4 @@
-"""Seconds from an event to what follows from it, shown at the end of a run beside the promise."""
+"""Seconds from an event to its effect, printed with the promise at the end of a run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The API of one cluster: kubectl for what a person types, `kubectl proxy` for all the rest.
+"""The API of one cluster: kubectl for the commands of users, `kubectl proxy` for other calls.
 
 The proxy knows how to log in, so that plain HTTP does here: calls take milliseconds, and watches
 tell of a change when it happens.
@@ -45,7 +45,7 @@ APPLY = "application/apply-patch+yaml"
 
 
 class Failed(Exception):
-    """A program ended with an error; the message is what it said."""
+    """Error of a program that failed.  The message is its output."""
 
 
 class Refused(Exception):
@@ -177,7 +177,7 @@ class Kube:
 class Stream:
     """Lines of a long answer, which a thread passes to ``tell`` until ``close``.
 
-    ``begin`` says anew for each connection what to ask for, or None to end.
+    ``begin`` returns the request of each new connection, or None to end.
     """
 
     def __init__(

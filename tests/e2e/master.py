@@ -88,7 +88,7 @@ class Api:
         self._apply(nobody)
 
     def _apply(self, change: Callable[[dict[str, Any]], dict[str, Any] | None]) -> None:
-        """Write what is the master's part of the spec; what is not in it goes.
+        """Write the master's part of the spec, and remove other fields of this part.
 
         Only into the pool as it was read: of two masters that come at once the second one sees
         the first.  The operator writes too, so that it may take more than one reading.

@@ -57,7 +57,7 @@ class Pool:
         self.scene.kube.patch(self._path, {"spec": spec})
 
     def attach(self, **spec: Any) -> None:
-        """Write what is the SDK's, as the SDK does: all of it, by server-side apply."""
+        """Write the SDK's fields as the SDK does: all of them, by server-side apply."""
         body = {
             "apiVersion": names.API_VERSION,
             "kind": names.KIND,
@@ -74,7 +74,7 @@ class Pool:
     def kubectl(self, *arguments: str) -> str:
         return self.scene.kube.kubectl("--namespace", self.scene.namespace, *arguments)
 
-    # What there is
+    # Reading the cluster
 
     @property
     def body(self) -> Body:

@@ -71,7 +71,7 @@ class Program:
         return said
 
     def prints(self, words: str, seconds: float = 60.0) -> None:
-        """Wait until these are among what it printed."""
+        """Wait until the program has printed these."""
         self._wait(f"it prints {words!r}", lambda: words in self.output, seconds)
 
     def ends(self, status: int = 0, seconds: float = 60.0) -> str:
@@ -81,7 +81,7 @@ class Program:
         return self.output
 
     def kill(self) -> None:
-        """Send SIGKILL; do nothing if it has ended."""
+        """Send SIGKILL unless the program has ended."""
         raise NotImplementedError
 
     def interrupt(self) -> None:
@@ -247,7 +247,7 @@ def _pod(
         "env": [{"name": name, "value": value} for name, value in environment.items()],
         "volumeMounts": [{"name": "program", "mountPath": _MOUNT}, *mounts],
         "resources": {"requests": {"cpu": "5m", "memory": "16Mi"}},
-        # What the restricted standard of pod security asks for, which its workers take over.
+        # Fields that the restricted standard of pod security requires.  The workers get them too.
         "securityContext": {
             "allowPrivilegeEscalation": False,
             "capabilities": {"drop": ["ALL"]},
@@ -276,7 +276,7 @@ class Programs:
         self.node: str | None = None
         """Node on which later programs inside run; None: any."""
         self.claims: tuple[str, ...] = ()
-        """PersistentVolumeClaims that what is started inside from now on mounts."""
+        """PersistentVolumeClaims that programs started inside from now on mount."""
         self.image: str | None = None
         """Image of later programs inside; None: one of the project's."""
         self._started: list[Program] = []

@@ -36,7 +36,7 @@ class Release:
         self._kube = kube
         self._home = home
         self.refused: set[tuple[str, str]] = set()
-        """Verb and resource of what the operators so far were not allowed to do."""
+        """Verb and resource of calls that were forbidden to the operators so far."""
         self._helm = find_program("helm")
         self._values = {
             "image": _image(images["fiber-operator"]),
@@ -97,7 +97,7 @@ class Release:
 
     @property
     def selector(self) -> str:
-        """Selects what is the release's."""
+        """Label selector of the release's objects."""
         return f"app.kubernetes.io/instance={self.name}"
 
     def may(self, verb: str, resource: str, namespace: str) -> bool:
@@ -113,7 +113,7 @@ class Release:
         return True
 
     def stop(self) -> None:
-        """Scale the operator to nothing and wait until it has ended."""
+        """Scale the operator to 0 and wait until it has ended."""
         self.note_refusals()
         self.scale(0)
         self.wait("no operator", lambda: not self.pods())
@@ -138,7 +138,7 @@ class Release:
         return self._kube.items(path_of("pods", self.namespace), labelSelector=selector)
 
     def log(self, lines: int = 40) -> str:
-        """The end of what the operator prints."""
+        """The end of the operator's log."""
         try:
             return "\n".join(self._log(pod, lines) for pod in self.pods())
         except Refused as refused:
@@ -150,7 +150,7 @@ class Release:
             yield sample[1], dict(_LABEL.findall(sample[2] or "")), float(sample[3])
 
     def note_refusals(self) -> None:
-        """Ask the operator, before it ends, what it was not allowed to do, and is not now.
+        """Ask the operator, before it ends, which calls were forbidden to it and still are.
 
         An API server that starts refuses all until it has read the roles. Creation is left out: a
         quota, a policy, or a namespace that goes may have refused it.
@@ -164,7 +164,7 @@ class Release:
 
     def _may_everywhere(self, verb: str, resource: str) -> bool:
         resource, _, part = resource.partition("/")
-        if (verb, resource) == ("patch", "leases"):  # of which it may patch this one alone
+        if (verb, resource) == ("patch", "leases"):  # it may patch only this one
             lease = f"leases/{names.SERVING_LEASE}"
             return self.may(verb, lease, names.SERVING_NAMESPACE)
         if (verb, resource) == ("update", "leases"):

@@ -1,4 +1,4 @@
-"""The chart's admission policy on a real API server: what it refuses, and what it lets pass."""
+"""The chart's admission policy on a real API server: refused and accepted templates."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Workers that do not start or do not last: what the status says, and how soon.
+"""Workers that do not start or do not last: the status reports them, and soon.
 
 All the pools are made at once, as most of the time is the kubelet's; each test waits for its own.
 """

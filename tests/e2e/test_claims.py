@@ -1,4 +1,4 @@
-"""Volumes of a program's pod: what its workers get of them."""
+"""Volumes of a program's pod, and those that its workers get."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Networks that are closed: nothing passes but what the chart and docs/kubernetes.md ask for."""
+"""Closed networks: only traffic that the chart and docs/kubernetes.md ask for passes."""
 
 from __future__ import annotations
 
@@ -80,20 +80,20 @@ def restart_operator(release: Release, scene: Scene, cluster: Cluster) -> None:
 
 
 def operator_egress(release: Release, ports: Sequence[int]) -> Iterator[Allowed]:
-    """Yield what the chart's policy lets out of the operator's pod."""
+    """Yield the traffic that the chart's policy lets out of the operator's pod."""
     values = {"networkPolicy": {"create": True, "apiServer": {"ports": list(ports)}}}
     return egress(rendered_policy(release, values), {})
 
 
 def program_traffic(host: str, ports: Sequence[int]) -> Iterator[Allowed]:
-    """Yield what docs/kubernetes.md asks for: the API server, and workers at the listen_port."""
+    """Yield the traffic of docs/kubernetes.md: the API server, and workers at the listen_port."""
     yield Allowed(host, "tcp", PORT)
     for port in ports:
         yield Allowed(protocol="tcp", port=port)
 
 
 def metrics_of(operator: Body) -> str:
-    """Return where a pod listens to everybody."""
+    """Return the ports at which a pod accepts connections from any address."""
     (port,) = operator["spec"]["containers"][0]["ports"]
     return f"{operator['status']['podIP']}:{port['containerPort']}"
 
@@ -125,7 +125,7 @@ def rendered_policy(release: Release, values: Body) -> Body:
 
 
 def egress(policy: Body, peers: Mapping[str, str]) -> Iterator[Allowed]:
-    """Yield what the policy lets out; ``peers`` has the addresses of pods that it selects."""
+    """Yield the traffic that the policy lets out; ``peers`` has the addresses of selected pods."""
     assert policy["spec"]["policyTypes"] == ["Ingress", "Egress"]
     for rule in policy["spec"]["egress"]:
         for peer in rule.get("to", [{"ipBlock": {"cidr": "0.0.0.0/0"}}]):

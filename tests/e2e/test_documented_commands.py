@@ -57,7 +57,7 @@ def commands(page: str) -> list[str]:
 
 
 class Shell:
-    """A reader's: what one command exports is there for the next."""
+    """Shell of a reader: variables that one command exports are there for the next."""
 
     _END = "[the command has ended]"
 

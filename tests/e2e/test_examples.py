@@ -1,4 +1,4 @@
-"""The examples give on pods what they give on one machine."""
+"""The examples give the same results on pods as on one machine."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Programs in namespaces that somebody guards: by standards, quotas, limits, webhooks."""
+"""Programs in namespaces with restrictions: standards, quotas, limits, webhooks."""
 
 from __future__ import annotations
 

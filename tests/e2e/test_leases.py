@@ -49,7 +49,7 @@ def master_of(pool: Pool, grace: int) -> Body:
 
 
 def make_lease(pool: Pool) -> None:
-    """Do what a master does once its pool exists."""
+    """Create and renew the Lease as a master does after its pool exists."""
     uid = pool.wait("it is there", lambda: pool.body["metadata"]["uid"] if pool.body else None)
     kind = {"apiVersion": names.API_VERSION, "kind": names.KIND}
     metadata = {

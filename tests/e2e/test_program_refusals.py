@@ -1,4 +1,4 @@
-"""Requests that cannot be met: the program gets an error at once that says what to do."""
+"""Requests that cannot be met: the program gets an error with a remedy at once."""
 
 from __future__ import annotations
 

@@ -88,7 +88,7 @@ def test_bar_on_a_terminal(tmp_path: Path) -> None:
 
 
 def read_all(terminal: int) -> str:
-    """Return what a program writes to its terminal until it ends."""
+    """Return the output of a program to its terminal until it ends."""
     parts: list[bytes] = []
     while True:
         try:

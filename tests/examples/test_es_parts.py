@@ -1,4 +1,4 @@
-"""The parts of examples/02-es that can be wrong without anybody noticing."""
+"""The parts of examples/02-es whose errors would not be noticed."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.fixture
 def launch() -> Iterator[Callable[..., Program]]:
-    """Starts a script as a ``Program``; what is left of it is ended after the test."""
+    """Starts a script as a ``Program``, whose processes are ended after the test."""
     programs: list[Program] = []
 
     def start(script: str, *arguments: str, **options: Any) -> Program:

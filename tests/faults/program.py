@@ -67,7 +67,7 @@ class Program:
 
     @property
     def stderr(self) -> str:
-        """Return what it, and all that it started, has written to stderr so far."""
+        """Return the text that the program and its processes have written to stderr so far."""
         return self._stderr.read_text(errors="replace")
 
     @property

@@ -67,7 +67,7 @@ class Finalized:
 
 
 class RandomCalls:
-    """The program.  ``failures`` says what went wrong."""
+    """The program, with its failures."""
 
     def __init__(self, mode: str, seed: int) -> None:
         self.failures: list[str] = []
@@ -81,7 +81,7 @@ class RandomCalls:
         self._armed = False
         self._over = False
         self._asked: deque[tuple[Any, int]] = deque()
-        """Results that handlers and finalizers have asked for, and what each is to be."""
+        """Results that handlers and finalizers have asked for, with the expected values."""
         self._spare: deque[Any] = deque()
         """Objects that finalizers drop."""
         self._pool = fiber.Pool(**self._random.choice(POOLS))
@@ -196,7 +196,7 @@ class RandomCalls:
         self._armed = armed
         return made
 
-    # What strikes
+    # Signals and garbage collections
 
     def _handle(self, signum: int, frame: Any) -> None:
         if self._over:
@@ -244,7 +244,7 @@ class RandomCalls:
     # The run
 
     def run(self, seconds: float) -> None:
-        """Make calls for so long, and then see what is left."""
+        """Make calls for ``seconds``, and then report leaks."""
         sys.unraisablehook = self._lost
         signal.signal(signal.SIGALRM, self._handle)
         sibling = threading.Thread(target=self._keep_calling, name="sibling")
@@ -376,7 +376,7 @@ def left(before: dict[str, str], interrupted: int) -> list[str]:
 def main() -> None:
     """Run as the arguments say."""
     mode, seed, seconds = sys.argv[1], int(sys.argv[2]), float(sys.argv[3])
-    warnings.simplefilter("ignore", ResourceWarning)  # of the pools that are dropped
+    warnings.simplefilter("ignore", ResourceWarning)  # threads of the pools that are dropped
     sys.setswitchinterval(1e-4)
     before = descriptors()
     calls = RandomCalls(mode, seed)

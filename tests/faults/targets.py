@@ -64,7 +64,7 @@ def hold(connection: Any) -> None:
 
 
 def echo(connection: Any) -> None:
-    """Send back what comes, until the other end is closed."""
+    """Send back each message until the other end is closed."""
     while True:
         try:
             message = connection.recv()
@@ -183,7 +183,7 @@ def get_one_and_block(queue: Any, connection: Any) -> NoReturn:
 
 
 def echo_without(connection: Any, other_end: Any, _: object) -> None:
-    """Let go of the other end, and send back what comes, until it is closed elsewhere too."""
+    """Close the other end here, and send back each message until it is closed elsewhere too."""
     other_end.close()
     echo(connection)
 
@@ -206,7 +206,7 @@ def echo_bytes(connection: Any) -> None:
 
 
 def obey(orders: Any) -> None:
-    """Do what comes by a manager's queue, until killed."""
+    """Run the calls of a manager's queue until killed."""
     kept = []
     while True:
         method, args = orders.get()
@@ -260,7 +260,7 @@ ORDERS: dict[str, Callable[..., None]] = {
 
 
 def touch_until_it_fails(shared: Any, connection: Any) -> None:
-    """Use a proxy until it raises, and send what it raised."""
+    """Use a proxy until it raises, and send the error."""
     shared.append(1)
     connection.send("touched")
     try:
@@ -302,7 +302,7 @@ def checksum(data: bytes) -> int:
 
 
 def echo_large(connection: Any, requests: Any, replies: Any) -> None:
-    """Send back what comes, after its checksum; first on a pipe, then on queues."""
+    """Send back each message after its checksum, first on a pipe, then on queues."""
     for receive, send, send_large in (
         (connection.recv_bytes, connection.send, connection.send_bytes),
         (requests.get, replies.put, replies.put),
@@ -347,7 +347,7 @@ class NeverPickled:
 
 
 def put_what_never_pickles(queue: Any, there: Any) -> None:
-    """Put an item that takes for ever to pickle."""
+    """Put an item whose pickling does not end."""
     queue.put(NeverPickled(there))
 
 

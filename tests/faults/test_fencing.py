@@ -63,7 +63,7 @@ NEXT_MASTER = """
 
 
 class Warm:
-    """A FiberPool ``warm`` with one pod, and what leads to its masters."""
+    """A FiberPool ``warm`` with one pod, and the path to its masters."""
 
     def __init__(self, cluster: FakeCluster, service: Proxy, way: Proxy) -> None:
         self.cluster = cluster

@@ -1,4 +1,4 @@
-"""Ctrl-C in each blocking call: KeyboardInterrupt at once, and nothing is left."""
+"""Ctrl-C in each blocking call: KeyboardInterrupt at once, and no leak."""
 
 from __future__ import annotations
 

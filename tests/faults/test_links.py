@@ -1,4 +1,4 @@
-"""Cut the network between master and agents: short cuts cost nothing, long ones only time."""
+"""Cut the network between master and agents: no task is lost, and long cuts cost time."""
 
 from __future__ import annotations
 

@@ -66,7 +66,7 @@ def test_an_infinite_one_of_a_call_goes_before_that_of_the_pool() -> None:
 def test_workers_of_a_pool_without_an_idle_timeout_stay() -> None:
     with fiber.Pool(min_workers=0, max_workers=1, idle_timeout=None) as pool:
         assert works(pool)
-        assert pool._executor._wake is None, "nothing will make it decide again"
+        assert pool._executor._wake is None, "no event makes the scheduler decide again"
         assert len(pool._pool) == 1
 
 

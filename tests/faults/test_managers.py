@@ -53,7 +53,7 @@ def tell(orders: Any, process: Any, method: str, *args: Any) -> Any:
     return None
 
 
-# Calls that raise what ends a thread
+# Calls that raise an exception which ends a thread
 
 
 ENDS = (SystemExit, KeyboardInterrupt, GeneratorExit)

@@ -74,7 +74,7 @@ def hand_on(depth: int, by: Any, of: Any) -> Any:
         pool = fiber.Pool(1)
         answer = pool.apply_async(hand_on, (depth - 1, by, of)).get(PATIENCE)
         pool.close()
-        pool.join()  # The worker ends once it has sent what it put.
+        pool.join()  # The worker ends after it has sent its items.
         return answer
     by.put(of)
     return of

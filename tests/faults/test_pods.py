@@ -287,7 +287,7 @@ def test_processes_and_pipes(cluster: FakeCluster) -> None:
         ours, theirs = fiber.Pipe()
         children = [fiber.Process(target=send, args=(theirs, word)) for word in "abc"]
         for child in children:
-            child.start()  # which waits for no pod
+            child.start()  # this call waits for no pod
         theirs.close()
         assert sorted(ours.recv() for _ in children) == ["a", "b", "c"]
         for child in children:

@@ -273,7 +273,7 @@ def test_outstanding_calls_fail_when_no_worker_starts() -> None:
     iterator = pool.imap(tasks.square, iter(range(10)))
     deadline = time.monotonic() + PATIENCE
     while not results[0].ready():
-        assert time.monotonic() < deadline, "workers are replaced for ever"
+        assert time.monotonic() < deadline, "the pool does not give up"
         for process in pool._pool:
             process.kill()
         time.sleep(0.001)

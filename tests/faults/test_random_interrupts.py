@@ -1,4 +1,4 @@
-"""Signals and the collector strike at random points of all kinds of calls; nothing is lost or left.
+"""Signals and garbage collections at random points of all kinds of calls lose and leak no object.
 
 ``RANDOM_INTERRUPTS_SEED`` repeats a run, as far as threads can be repeated;
 ``RANDOM_INTERRUPTS_SECONDS`` is how long each takes.

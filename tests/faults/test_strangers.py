@@ -1,4 +1,4 @@
-"""Strangers at the sockets: they can stop nothing, read nothing and run nothing."""
+"""Strangers at the sockets cannot stop, read or run anything."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def test_tls_without_a_proof_gets_no_word(backend: LoopbackBackend) -> None:
         try:
             with context.wrap_socket(plain, server_hostname="x") as stranger:
                 stranger.sendall(b"hello?")
-                stranger.recv(32)  # random bytes, as everybody gets
+                stranger.recv(32)  # the random bytes that any client gets
                 heard = stranger.recv(100)
         except (ssl.SSLError, ConnectionError):
             heard = b""
@@ -206,7 +206,11 @@ def test_another_user_cannot_connect_to_the_hubs_socket(door: str) -> None:
 
     folder = os.path.dirname(door)
     assert knock() == "PermissionError\n"
-    for opened in (os.path.dirname(folder), folder, door):  # as if somebody had opened the way
+    for opened in (
+        os.path.dirname(folder),
+        folder,
+        door,
+    ):  # as if another process had changed the permissions
         os.chmod(opened, os.stat(opened).st_mode | 0o007)
     assert knock() in ("heard b''\n", "ConnectionResetError\n", "BrokenPipeError\n")
     works()

@@ -142,7 +142,7 @@ def test_programs_whose_imports_start_threads_work(
     launch: Callable[..., Program], request: pytest.FixtureRequest, kind: str, backend: str
 ) -> None:
     if backend == "kubernetes":
-        request.getfixturevalue("cluster")  # which sets KUBECONFIG
+        request.getfixturevalue("cluster")  # this fixture sets KUBECONFIG
     program = launch(written(kind), env={"FIBER_BACKEND": backend, "FIBER_AGENTS": "1"})
     assert [program.line() for _ in GOOD] == GOOD
     assert program.wait() == 0

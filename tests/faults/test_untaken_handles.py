@@ -1,4 +1,4 @@
-"""Connections in messages that nobody receives."""
+"""Connections in messages that no process receives."""
 
 from __future__ import annotations
 

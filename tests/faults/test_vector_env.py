@@ -193,7 +193,7 @@ def test_a_worker_that_dies_in_a_call(vector_env: Make) -> None:
         pytest.raises(fiber.WorkerDied, match="a call"),
     ):
         env.call("exit", 0)
-    assert len(env.call("pid")) == 4  # of workers that are being started just now
+    assert len(env.call("pid")) == 4  # processes of workers that are starting
     works(env)
 
 

@@ -88,7 +88,7 @@ class Agent:
         self.down.send(child.be_born)
 
     def cut(self, seconds: float) -> None:
-        """Let nothing through for a while."""
+        """Delay all frames for a while."""
         if self.up.is_cut:
             return
         self.world.note("%s is cut off for %g s", self.host, seconds)
@@ -189,7 +189,7 @@ class Child:
         return self._channel
 
     def reclaim(self) -> None:
-        """Hear what it says again."""
+        """Deliver the messages of the agent again."""
         channel, self._channel = self._channel, None
         if channel is not None:
             for message in channel.drain():

@@ -38,7 +38,7 @@ class Names(Protocol):
 
 
 class Audit:
-    """Checks each decision of one ledger, and what it keeps, against what the oracle knows."""
+    """Checks each decision and the state of one ledger against the oracle."""
 
     def __init__(
         self,

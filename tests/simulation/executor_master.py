@@ -1,4 +1,4 @@
-"""The real executor, asked for what the schedule plans, over simulated workers."""
+"""The real executor over simulated workers, with the calls of the schedule."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ MOST = 100
 
 
 class Names:
-    """Tells the audit what the executor's objects stand for."""
+    """Maps the executor's objects to those of the audit."""
 
     def account(self, job: engine.Job) -> Account | None:
         """Whose job it is; calls share one."""
@@ -383,9 +383,9 @@ class ExecutorMaster:
         self._executor.terminate(RuntimeError("terminated"))
 
     def heard_late(self, child: Child, said: Any) -> None:
-        """A child handle says nothing after the end of its child."""
+        """A child handle reports no event after the end of its child."""
 
-    # What must hold
+    # Invariants
 
     @property
     def is_closing(self) -> bool:
@@ -409,7 +409,7 @@ class ExecutorMaster:
         self._audit.check()
 
     def check_end(self) -> None:
-        """All is quiet: then the pool closes, and nothing stays behind."""
+        """Close the pool when all is quiet, and check that no object is left."""
         for account in self.world.oracle.accounts:
             missing = len(account.plan.tasks) - account.fed
             excused = account.cancelled or account.refused or account.plan.everywhere

@@ -1,4 +1,4 @@
-"""Runs schedules; makes one that fails as small as it can, and tells how to run it again."""
+"""Runs schedules, shrinks one that fails, and prints how to run it again."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Suite(NamedTuple):
 
 
 class Failure(Exception):
-    """A schedule that breaks a promise, as small as it was made, and what happens in it."""
+    """A schedule that breaks a promise, shrunk, and its events."""
 
     def __init__(self, schedule: Schedule, error: Exception, trace: list[str], again: str) -> None:
         self.schedule = schedule
@@ -106,7 +106,7 @@ def _kind(error: Exception | None) -> tuple[type | None, str]:
 
 
 def describe(schedule: Schedule) -> list[str]:
-    """A schedule for a person; what is as usual is left out."""
+    """A schedule as text, without the default values."""
     lines = [f"seed={schedule.seed}, workers={schedule.min_workers} to {schedule.max_workers}"]
     lines[0] += f", left={schedule.left}, linger={schedule.linger}"
     lines += [f"host {number}: {agent}" for number, agent in enumerate(schedule.agents)]

@@ -1,4 +1,4 @@
-"""The least that an executor does: what the ledger says, followed to the letter, and checked."""
+"""The smallest executor: it carries out the ledger's decisions and checks them."""
 
 from __future__ import annotations
 
@@ -74,13 +74,13 @@ class Member:
         self._master.exited(self, report)
 
     def stop(self) -> None:
-        """Ask it to end after what it has."""
+        """Ask the worker to end after its batches."""
         self.leaving = True
         self.child.deliver(STOP, None)
 
 
 class Names:
-    """Tells the audit what the master's objects stand for."""
+    """Maps the master's objects to those of the audit."""
 
     def account(self, job: engine.Job) -> Account | None:
         """Whose job it is; None if a caller sent it directly."""
@@ -229,7 +229,7 @@ class LedgerMaster:
             self._take(worker, said)
 
     def heard_late(self, child: Child, said: Any) -> None:
-        """A worker that was given up says something: it must count for nothing."""
+        """A worker that was given up answers: the answer must be ignored."""
         worker = self._gone.get(child)
         if worker is not None and isinstance(said, Results):
             _require_dropped(self._receive(worker, said))
@@ -267,7 +267,7 @@ class LedgerMaster:
 
     def _look(self, job: engine.Job) -> None:
         account: Account = job.owner
-        # Of several results that arrive together, the job counts all before it reports the first.
+        # The job counts all results of a message before it reports the first.
         if job.finished and account.delivered == account.everything:
             self._finished(account)
 
@@ -348,7 +348,7 @@ class LedgerMaster:
                 self._later(account.plan.timeout, self._expire, batch)
 
     def _lease(self) -> None:
-        """Leave an idle worker to somebody who may call it directly, for a while."""
+        """Lease an idle worker to a caller for a while."""
         idle = self.ledger.idle()
         if not idle or not self.ledger.lease(worker := self._rng.choice(idle)):
             return
@@ -428,7 +428,7 @@ class LedgerMaster:
         return True
 
     def leave_process(self) -> None:
-        """Do nothing: the master changes no global state of the process."""
+        """Keep the global state of the process, which the master does not change."""
 
     def check_end(self) -> None:
         """Check that no work is left over."""

@@ -24,12 +24,12 @@ from fiber._wire.messages import MemoryMessage
 
 MASTER = "master"
 RACY = 24
-"""Bytes at the end of the block that everybody writes."""
+"""Bytes at the end of the block that all processes write."""
 
 
 @dataclass
 class Token:
-    """The right to write to a slot, and what was written."""
+    """The right to write to a slot, and the value that was written."""
 
     start: int
     expected: bytes
@@ -98,7 +98,7 @@ class Process:
         raise AssertionError(reason)
 
     def receive(self, token: Token | None) -> None:
-        """Check that the receiver of a token finds in its memory what was written under it."""
+        """Check that the receiver of a token finds the last write under it in its memory."""
         if self.memory is None:
             self.waiting.append(token)
         elif token is not None:
@@ -169,7 +169,7 @@ class World:
             value = self.rng.randrange(1, 256)
             self.written.add(value)
             process.memory[self.size - self.rng.randint(1, RACY)] = value
-            assert set(process.memory[-RACY:]) <= self.written, "a byte that nobody wrote"
+            assert set(process.memory[-RACY:]) <= self.written, "a byte that no process wrote"
 
     def _pass(self) -> None:
         sender, to = self.rng.choice(self.processes), self.rng.choice(self.processes)
@@ -200,7 +200,7 @@ class World:
             receiver.receive(host.name, wire.popleft())
 
     def _settle(self) -> None:
-        """Until there is nothing more to say."""
+        """Deliver until no message is left."""
         for process in self.processes:
             if process.memory is None:
                 process.host.replicas.join(self.origin, process, process)

@@ -1,4 +1,4 @@
-"""Promises of a pool: compares what the user sees with what truly happened to each task.
+"""Promises of a pool: compares the user's results with the true history of each task.
 
 The oracle knows what no executor can know: when each simulated worker began and ended each task.
 """
@@ -67,10 +67,10 @@ class Oracle:
         self._left = schedule.left
         self._lost: set[Worker] = set()
 
-    # What truly happens
+    # True events
 
     def begins(self, ref: Ref, worker: Worker) -> None:
-        """``worker`` begins a task: the first time, or because an earlier run came to nothing."""
+        """Note that ``worker`` begins a task, for the first time or after a run that was lost."""
         if ref == NO_OP or worker in self._lost:  # cut off: the master cannot know its result
             return
         account = self.accounts[ref.job]
@@ -126,7 +126,7 @@ class Oracle:
             raise Violation(f"{ref} fails, though it could have been tried again")
 
     def died(self, ref: Ref, deaths: int, disruptions: int) -> None:
-        """The user hears that a task has lost its last worker."""
+        """Note that the user gets the error of a task that has lost its last worker."""
         account = self.accounts[ref.job]
         limits = limits_of(account.plan)
         used_up = deaths == limits.retries + 1, disruptions == limits.disruptions + 1
@@ -153,7 +153,7 @@ class Oracle:
         self.accounts[number].closed = True
 
     def finished(self, number: int) -> None:
-        """The user hears that a job is over."""
+        """Note that the user gets the end of a job."""
         account = self.accounts[number]
         if account.finished or account.cancelled:
             raise Violation(f"job {number} is finished twice or after it was cancelled")

@@ -49,7 +49,7 @@ class Outcomes:
         self._ended = False
 
     def add_results(self, start: int, outcomes: list[Any], mixed: bool, size: int = 0) -> bool:
-        """Outcomes of tasks from ``start`` on; sometimes nobody reads them for a while."""
+        """Outcomes of tasks from ``start`` on, which are sometimes unread for a while."""
         if not mixed and any(type(outcome) in (TaskFailure, Pickled) for outcome in outcomes):
             raise Violation(f"job {self.account.number} has results that are not plain")
         for index, outcome in enumerate(outcomes, start if self.call is None else self.call):
@@ -142,7 +142,7 @@ class Outcomes:
             self._caller.put(HEARD)
 
     def get(self) -> object:
-        """The caller waits until the outcome is there, which the oracle is told."""
+        """Wait for the outcome as the caller, and report it to the oracle."""
         assert self._caller is not None
         return self._caller.get()
 
@@ -154,7 +154,7 @@ class Outcomes:
             self._oracle.finished(self.account.number)
 
     def interrupted(self) -> None:
-        """The caller does not wait for it any more."""
+        """End the caller's wait."""
         self._oracle.delivered(Ref(self.account.number, self.call or 0), "interrupted")
         self._ended = True
         if self._master.ended_call(self.account):

@@ -46,7 +46,7 @@ class Reading(NamedTuple):
 
 
 class PoolAudit:
-    """Checks what one executor does; ``check_ledger`` checks its ledger."""
+    """Checks the actions of one executor; ``check_ledger`` checks its ledger."""
 
     def __init__(
         self, world: World, stage: Stage, executor: PoolExecutor, check_ledger: Callable[[], None]
@@ -177,7 +177,7 @@ class PoolAudit:
             lasts = self._failures[-1][0] - self._failures[0][0]
             require(lasts < SAID_AFTER, "no worker starts, and the user is not told")
 
-    # What may last for a moment, but no longer
+    # States that may last for a moment only
 
     def _lasts(self, key: Any, holds: bool, allowed: Callable[[], float], otherwise: str) -> None:
         """Violation if ``holds`` is so for longer than ``allowed``."""
@@ -211,7 +211,7 @@ class PoolAudit:
         workers = self._workers
         if self._scheduler.terminated or workers.error is not None or workers.starting:
             return False
-        # Nor does a caller come for results that wait until earlier ones are read.
+        # A caller does not fetch results that wait until earlier ones are read.
         tasks = sum(
             (job.reached if job.paused else job.fed) - job.done for job in self._ledger.jobs
         )

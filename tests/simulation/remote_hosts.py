@@ -76,7 +76,7 @@ class RemoteHost(Agent):
         return self._seen[name]
 
     def cut(self, seconds: float) -> None:
-        """Let nothing through for a while."""
+        """Delay all frames for a while."""
         if self.is_cut:
             return
         self.world.note("%s is cut off for %g s", self.host, seconds)
@@ -127,7 +127,7 @@ class LocalPort:
 
 
 class Seen:
-    """A remote worker from the master's side: what the oracle wants to know, and an observer."""
+    """A remote worker from the master's side: its events for the oracle, and its observer."""
 
     def __init__(self, agent: RemoteHost, name: str, observer: ChildObserver) -> None:
         self.agent = agent
@@ -177,7 +177,7 @@ class NoCapture(SimpleNamespace):
         super().__init__()
 
     def started(self) -> None:
-        """Do nothing: the pipe has its own descriptors."""
+        """Keep the descriptors, which belong to the pipe."""
 
     def finish(self) -> tuple[str, ...]:
         """Return no output."""

@@ -20,7 +20,7 @@ from simulation.suites import SUITES, again
 
 
 def show(suite: str, seed: int) -> bool:
-    """Print what happens in one schedule; False if it breaks a promise."""
+    """Print the events of one schedule.  Return False if it breaks a promise."""
     schedule = draw(seed)
     trace: list[str] = []
     error = run(schedule, SUITES[suite], trace)

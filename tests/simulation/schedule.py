@@ -17,7 +17,7 @@ class Act(enum.Enum):
     FINE = enum.auto()
     RAISES = enum.auto()
     RETRIED = enum.auto()
-    """Raises what the pool retries, for the first ``times`` runs."""
+    """Raises an exception that the pool retries, in the first ``times`` runs."""
     POISON = enum.auto()
     """Kills each worker that runs it."""
     FATAL = enum.auto()

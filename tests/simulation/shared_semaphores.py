@@ -94,7 +94,7 @@ class World:
     # Memory
 
     def load(self, start: int, size: int) -> bytes:
-        """Read, what this processor has stored included."""
+        """Read the memory with the stores of this processor."""
         self.current.step()
         found = bytearray(self._memory[start : start + size])
         for at, data in self.current.stores:
@@ -109,7 +109,7 @@ class World:
         self.current.stores.append((start, data))
 
     def empty(self, process: Process, count: int | None = None) -> None:
-        """All see what that one has stored."""
+        """Make the stores of that processor visible to all."""
         while process.stores and count != 0:
             self._put(*process.stores.pop(0))
             count = None if count is None else count - 1
@@ -117,7 +117,7 @@ class World:
     def _put(self, start: int, data: bytes) -> None:
         self._memory[start : start + len(data)] = data
 
-    # Stand-ins for what the code uses
+    # Stand-ins for functions that the code uses
 
     def sleep(self, seconds: float) -> None:
         """Make all earlier stores visible to all."""
@@ -127,7 +127,7 @@ class World:
         self._now += seconds
 
     def monotonic(self) -> float:
-        """Time goes on whenever somebody looks."""
+        """Clock that advances at each read."""
         self._now += 0.03
         return self._now
 

@@ -58,7 +58,7 @@ class Stage:
         self.bad_item = BadItem
 
     def enter(self) -> None:
-        """Take the places of what cannot be handed over."""
+        """Replace functions that cannot be passed as arguments."""
         self._stack.enter_context(mock.patch.object(service, "Capture", NoCapture))
         channel = partial(StagedTaskChannel, self)
         self._stack.enter_context(mock.patch.object(remote, "RemoteTaskChannel", channel))
@@ -92,7 +92,7 @@ class Stage:
     def start(self, process: Any, owner: Any, *, tasks: bool, method: str, shared: object) -> None:
         """Start a worker on some agent."""
         if self.running is not None:
-            # What comes of it comes after all that this thread has asked for.
+            # The result comes after all earlier requests of this thread.
             self.running.sleep(self.loop.heard_in(self.running.name) + self.loop.moment())
         self._started += 1
         famine = self.world.famine()
@@ -383,7 +383,7 @@ class StagedChannel:
         return None
 
     def close(self) -> None:
-        """Do nothing: the channel has no resources."""
+        """Close the channel, which has no resources."""
 
     def hear(self, message: Any) -> None:
         """The worker sent it."""
@@ -405,7 +405,7 @@ class StagedChannel:
 
 
 class StagedTaskChannel(RemoteTaskChannel):
-    """The channel of a worker on another host: the real one, but for how its callers wait."""
+    """The channel of a worker on another host: the real one with another wait for callers."""
 
     def __init__(self, stage: Stage, loop: Any, deliver: Callable[..., bool]) -> None:
         super().__init__(loop, deliver)

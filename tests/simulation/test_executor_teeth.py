@@ -1,4 +1,4 @@
-"""The simulation finds what is wrong with executors, too: what is named here breaks one promise."""
+"""The simulation finds faults of executors: each fault here breaks one promise."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ Fault = Callable[[Patch], None]
 
 
 def forgets_unsent_tasks(patch: Patch) -> None:
-    """Takes what was assigned, but not sent, for something that its worker may have run."""
+    """Takes a batch that was assigned, but not sent, for one that its worker may have run."""
 
     def lost(self: BatchSender, worker: WorkerEntry) -> set[int]:
         real(self, worker)
@@ -117,7 +117,7 @@ def drops_answers(patch: Patch) -> None:
 
 
 def drops_ends_of_workers(patch: Patch) -> None:
-    """A handle that tells nobody when its worker is gone before it was ready."""
+    """A handle that does not report a worker that died before it was ready."""
 
     def exited(self: WorkerHandle, report: Any) -> None:
         if self.worker is not None:

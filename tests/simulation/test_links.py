@@ -1,4 +1,4 @@
-"""Liveness: silence is judged by what was truly heard, and no frame is lost by a judgement."""
+"""Liveness: silence is judged by received datagrams, and no judgement loses a frame."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ TICK = KEEPALIVE.heartbeat / 3 + 0.05
 
 
 class Judge:
-    """Hears what one end of a link tells, and knows when that end truly heard of the other."""
+    """Observer of one end of a link, which knows when that end received a datagram."""
 
     def __init__(self, loop: SimulatedLoop, link: Link) -> None:
         self.frames: list[bytes] = []
@@ -43,7 +43,7 @@ class Judge:
 
     @property
     def silence(self) -> float:
-        """Seconds since this end heard of the other."""
+        """Seconds since this end received a datagram."""
         return self._loop.now() - self._heard_at
 
     def on_frame(self, frame: Frame) -> None:

@@ -1,4 +1,5 @@
-"""Shared memory of several hosts: who is told of a write finds it, and all copies agree in the end.
+"""Shared memory of several hosts: a process that gets a message finds earlier writes, and all
+copies agree in the end.
 
 python -c 'from simulation.memory_hosts import World; World(SEED).run(300)'
 """
@@ -33,7 +34,7 @@ def run_all(seeds: range) -> None:
 
 
 def every_third(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The same, but every third call does nothing."""
+    """The same method, which ignores every third call."""
     calls = 0
 
     def sometimes(*args: Any) -> Any:

@@ -1,4 +1,4 @@
-"""A simulated pool worker: reads a message, runs its tasks, answers; dies where it is told to.
+"""A simulated pool worker: reads a message, runs its tasks, answers, and dies as scheduled.
 
 It keeps the rules of ``fiber._agent.worker``: one message at a time, a note on the board before
 each stride of tasks, results in order and in one or more pieces, and, of a batch that runs for too
@@ -32,7 +32,7 @@ class Ref(NamedTuple):
 
 
 NO_OP = Ref(-1, 0)
-"""A call that does nothing, and is nobody's."""
+"""A call without effect and owner."""
 
 
 class Work(NamedTuple):
@@ -135,7 +135,7 @@ class Worker:
             self._later(self._rng.random() * MOMENT, self._read)
 
     def stop_for(self, seconds: float) -> None:
-        """Do nothing for a while, as after SIGSTOP."""
+        """Stop for a while, as after SIGSTOP."""
         self._world.note("%s is stopped for %g s", self.name, seconds)
         self._stopped_until = max(self._stopped_until, self._world.loop.now() + seconds)
 

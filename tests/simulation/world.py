@@ -36,7 +36,7 @@ from simulation.schedule import (
 from simulation.workers import NO_OP, Broken, Ref, Unknown, Work, Worker
 
 PATIENCE = 300
-"""Simulated seconds after which what did not happen over links never will."""
+"""Simulated seconds after which a missing event of a link counts as lost."""
 
 CALLS = 50_000
 """More calls than any schedule needs: it goes round in circles."""
@@ -70,7 +70,7 @@ class Loop(SimulatedLoop):
         self._heard_at: dict[str, float] = {}
 
     def depend(self, dependent: object) -> None:
-        """Do nothing: this loop never fails."""
+        """Ignore the dependent: this loop never fails."""
 
     def on_thread(self) -> bool:
         """Return whether the caller may take this for the loop thread."""

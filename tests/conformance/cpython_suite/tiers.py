@@ -12,7 +12,7 @@ from typing import Literal
 
 Tier = Literal["core", "prompt", "local", "ext", "na"]
 
-# Looks at once at what pods do only once somebody uses it.  It may be fast enough now and then.
+# Reads at once a state that pods have only after the first use.  It may pass by chance.
 PROMPT = {
     "TestInitializers.test_manager_initializer": "a manager's server may wait for its pod",
     "TestInitializers.test_pool_initializer": "a pool's workers start with its first task",

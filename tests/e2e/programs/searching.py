@@ -1,4 +1,4 @@
-"""Libraries that search: what they find by Fiber is what they find alone, and is printed."""
+"""Libraries that search: print their results, which are the same with Fiber and without."""
 
 from __future__ import annotations
 

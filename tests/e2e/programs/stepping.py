@@ -1,4 +1,4 @@
-"""Steps counters, each in a process of its own, as a vector of environments is stepped.
+"""Steps counters in separate processes, as a vector of environments is stepped.
 
 Says in JSON, a line each: ``stepping`` after some steps, with the hosts of the processes, and at
 the end ``done`` with the sum of the counters, or ``lost`` with the error that a lost one gives.
