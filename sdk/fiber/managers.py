@@ -3,8 +3,7 @@
 The proxies, ``RemoteError``, ``Token`` and ``Namespace`` are multiprocessing's classes.
 
 Differs from multiprocessing when a process is killed.  Objects to which only it referred are
-dropped, and the locks that it held are released.  The next holder of such a lock gets a
-RuntimeWarning that names the process.
+dropped, and the locks that it held are released: the locks of a manager are Fiber's own.
 """
 
 from __future__ import annotations
@@ -31,7 +30,6 @@ from fiber._hub import client as hub_client
 from fiber._managers import SERIALIZER, client
 from fiber._managers.asynchronous import AsyncBaseProxy, AsyncProxyResult
 from fiber._managers.client import ManagerAddress
-from fiber._managers.locks import ManagedRLock, condition
 from fiber._managers.server import Server
 from fiber._runtime.state import runtime
 from fiber.connection import Connection, Pipe
@@ -351,12 +349,5 @@ class AsyncManager(BaseManager):
         super().register(typeid, callable, proxytype or AsyncBaseProxy, *args, **options)
 
 
-_OURS: dict[str, Callable[..., Any]] = {
-    "Condition": condition,
-    "Pool": _pool,
-    "RLock": ManagedRLock,
-}
-
-for _typeid, _callable in _OURS.items():
-    _, _exposed, _typeids, _proxytype = _mp.SyncManager._registry[_typeid]
-    SyncManager.register(_typeid, _callable, _proxytype, _exposed, _typeids, create_method=False)
+_, _exposed, _typeids, _proxytype = _mp.SyncManager._registry["Pool"]
+SyncManager.register("Pool", _pool, _proxytype, _exposed, _typeids, create_method=False)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import multiprocessing.managers
+import pickle
 import re
 import signal
 import subprocess
@@ -20,9 +21,9 @@ import pytest
 
 import fiber
 from census import wait_until
-from fiber._managers.client import CallChannel
+from fiber._managers.client import CallChannel, session
 from fiber._runtime.state import runtime
-from fiber.managers import BaseManager, RemoteError, SyncManager
+from fiber.managers import AcquirerProxy, BaseManager, RemoteError, SyncManager
 from fiber.process import current_process
 from fiber.resources import Resources, resources_of
 from patience import PATIENCE
@@ -214,12 +215,108 @@ def acquire(lock: Any) -> None:
     lock.acquire()
 
 
-def test_a_process_that_ends_in_good_order_leaves_its_locks_to_others(manager: Any) -> None:
+def test_another_process_may_release_a_lock(manager: Any) -> None:
     lock = manager.Lock()
     call(acquire, lock)
-    assert not lock.acquire(False)
     lock.release()
     assert lock.acquire(False)
+    assert not lock.acquire(False)
+
+
+def test_a_condition_has_the_lock_of_a_proxy(manager: Any) -> None:
+    lock = manager.RLock()
+    condition = manager.Condition(lock)
+    with condition:
+        assert acquired_elsewhere(lock) == [False]
+    assert acquired_elsewhere(lock) == [True]
+
+
+@pytest.mark.parametrize("kind", ["Lock", "RLock", "BoundedSemaphore"])
+def test_a_release_too_many_is_the_error_of_threading(manager: Any, kind: str) -> None:
+    lock = getattr(manager, kind)()
+    with pytest.raises(ValueError if kind == "BoundedSemaphore" else RuntimeError):
+        lock.release()
+    with lock:
+        pass
+
+
+def test_waiting_without_the_lock_is_the_error_of_threading(manager: Any) -> None:
+    with pytest.raises(RuntimeError, match="must acquire"):
+        manager.Condition().wait()
+
+
+def test_minus_one_is_no_timeout(manager: Any) -> None:
+    lock, asked = manager.Lock(), threading.Event()
+    lock.acquire()
+    got: list[bool] = []
+
+    def wait() -> None:
+        asked.set()
+        got.append(lock.acquire(True, -1))
+
+    waiter = background(wait)
+    assert asked.wait(PATIENCE)
+    lock.release()
+    waiter.join(PATIENCE)
+    assert got == [True]
+
+
+def test_waiters_take_no_threads_of_the_manager(manager: Any) -> None:
+    lock, tasks = manager.Lock(), Path(f"/proc/{manager._process.pid}/task")
+    lock.acquire()
+    before = len(list(tasks.iterdir()))
+    waiters = [background(pass_through, lock) for _ in range(20)]
+    lock.release()
+    for waiter in waiters:
+        waiter.join(PATIENCE)
+    assert len(list(tasks.iterdir())) == before
+
+
+def pass_through(lock: Any) -> None:
+    with lock:
+        pass
+
+
+class LockManager(BaseManager):
+    pass
+
+
+LockManager.register("Lock", threading.Lock, AcquirerProxy)
+LockManager.register("Plain", threading.Lock)
+
+
+def test_a_lock_of_threading_that_is_registered_is_fibers(manager: Any) -> None:
+    with LockManager() as manager:
+        lock, plain = manager.Lock(), manager.Plain()
+        call(acquire, lock)
+        call(acquire, plain)
+        with pytest.warns(RuntimeWarning, match="ended while it held"):
+            assert lock.acquire()
+        assert plain.locked()
+    manager._process.close()
+
+
+def test_the_locks_of_a_manager_with_an_address_are_those_of_threading() -> None:
+    with SyncManager(("127.0.0.1", 0)) as manager:
+        with manager.RLock() as acquired:
+            assert acquired
+        with pytest.raises(RuntimeError):
+            manager.Lock().release()
+        condition = manager.Condition()
+        with condition:
+            assert not condition.wait(0)
+    manager._process.close()
+
+
+def test_a_lock_goes_with_its_last_proxy(manager: Any) -> None:
+    before = len(session(manager.address)._locks)
+    lock = manager.Lock()
+    same = pickle.loads(pickle.dumps(lock))
+    del lock
+    assert same.acquire(False)
+    assert len(session(manager.address)._locks) == before + 1
+    del same
+    assert len(session(manager.address)._locks) == before
 
 
 def acquire_and_die(lock: Any) -> None:
@@ -236,7 +333,7 @@ def test_a_warning_turned_into_an_error_releases_the_lock(manager: Any) -> None:
     child.join(PATIENCE)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        with pytest.raises(RuntimeWarning, match=rf"{child.name}.*held this lock"):
+        with pytest.raises(RuntimeWarning, match=rf"{child.name} .*ended while it held a lock"):
             lock.acquire(True, PATIENCE)
     assert lock.acquire(False)
 
@@ -267,17 +364,14 @@ def test_an_item_of_an_interrupted_call_goes_to_the_next(
         channel._channel.poll(PATIENCE)
         raise KeyboardInterrupt
 
-    queue, lock, condition = manager.Queue(), manager.Lock(), manager.Condition()
+    queue = manager.Queue()
     queue.put(1)
     queue.put(2)
-    for call in (queue.get, lock.acquire, condition.acquire):
-        with monkeypatch.context() as patch:
-            patch.setattr(CallChannel, "answer", interrupt_late)
-            with pytest.raises(KeyboardInterrupt):
-                call()
+    with monkeypatch.context() as patch:
+        patch.setattr(CallChannel, "answer", interrupt_late)
+        with pytest.raises(KeyboardInterrupt):
+            queue.get()
     assert [queue.get(), queue.get()] == [1, 2]
-    assert lock.acquire(True, PATIENCE)
-    assert condition.acquire(True, PATIENCE)
 
 
 def test_an_interruption_does_not_undo_an_earlier_call(
@@ -352,17 +446,12 @@ def acquired_elsewhere(lock: Any) -> list[bool]:
     return got
 
 
-def test_an_interrupted_wait_keeps_the_lock_of_its_thread_right(manager: Any) -> None:
+def test_an_interrupted_wait_acquires_the_condition_again(manager: Any) -> None:
     condition = manager.Condition()
-    with struck(TooLong):
-        condition.acquire()
-        condition.wait()
     with condition:
-        condition.notify()
+        with struck(TooLong):
+            condition.wait()
         assert acquired_elsewhere(condition) == [False]
-    wait_until(lambda: acquired_elsewhere(condition) == [True], PATIENCE)
-    with condition, condition:
-        pass
     assert acquired_elsewhere(condition) == [True]
 
 

@@ -14,7 +14,7 @@ import pytest
 import fiber
 from census import wait_until
 from fiber import synchronize
-from fiber._hub import hosted
+from fiber._hub import hosted, shared_blocks
 from fiber._hub.client import HubStream
 from fiber._hub.protocol import Op
 from hosts import Far, Hosts, background
@@ -43,6 +43,13 @@ def on_thread(action: Callable[[], Any]) -> Any:
     results: list[Any] = []
     background(lambda: results.append(action())).join(PATIENCE)
     return results[0]
+
+
+def test_a_thousand_threads_can_wait() -> None:
+    waiters = shared_blocks.create_wait_list()
+    places = [waiters.enter() for _ in range(1000)]
+    waiters.notify(999)
+    assert [waiters.leave(place) for place in places] == [True] * 999 + [False]
 
 
 def waiter(condition: Any, woken: list[Any], name: str) -> threading.Thread:

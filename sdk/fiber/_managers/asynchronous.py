@@ -23,7 +23,7 @@ from typing import Any
 from fiber import reduction
 from fiber._exceptions import fresh
 from fiber._hub.client import ObjectUnreachable
-from fiber._managers.client import NUMBER, ManagerSession, new_holder, proxy_of, session
+from fiber._managers.client import NUMBER, ManagerSession, proxy_of, session
 from fiber._runtime.threads import Waiters, acquire
 from fiber.errors import ConnectionClosed, TimeoutError
 
@@ -75,7 +75,7 @@ class Pipeline:
     def __init__(self, server: ManagerSession) -> None:
         self.pid = os.getpid()
         self._session = server
-        self._channel = server.open_channel(new_holder())
+        self._channel = server.open_channel()
         self._numbers = itertools.count(1)
         self._answered = 0
         self._sending = threading.RLock()
@@ -168,8 +168,9 @@ class Pipeline:
             self._settle(lost, "#ERROR", InterruptedError("the answer was lost to a signal"))
         self._answered = number
         if not self._settle(number, kind, value) and kind == "#PROXY":
-            self._session.add_reference()
-            self._session.drop_reference(str(value[1].id))
+            ident = str(value[1].id)
+            self._session.add_reference(ident)
+            self._session.drop_reference(ident)
 
     def _settle(self, number: int, kind: str, value: Any) -> bool:
         """Store the outcome of a call; return False if its result was forgotten."""

@@ -12,27 +12,25 @@ changes a reference count.  The end of the control channel tells the server that
 
 from __future__ import annotations
 
-import contextlib
 import errno
-import itertools
 import os
 import pickle
 import struct
 import time
-import warnings
 import weakref
-from collections import deque
+from collections import Counter, deque
 from multiprocessing import util
 from multiprocessing.managers import Token
 from multiprocessing.process import BaseProcess, current_process
 from threading import current_thread, main_thread
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 from fiber import reduction
 from fiber._hub import handles
-from fiber._hub.client import ObjectUnreachable, host
+from fiber._hub.client import ObjectUnreachable
 from fiber._hub.handles import HubHandle, collecting_grants
 from fiber._hub.local import LocalChannel
+from fiber._managers import primitives
 from fiber._transport.channels import Channel
 from fiber._wire import packet
 from fiber.connection import how_it_ended
@@ -47,20 +45,17 @@ A number that a channel skips belongs to a call that was interrupted while it wa
 TAKE_BACK = "take_back"
 """Method of the server: undo the last call of a channel, whose caller was interrupted."""
 
-JOIN, OPEN_CHANNEL, INCREF, DECREF, LEAVE = "join", "channel", "incref", "decref", "leave"
+JOIN, OPEN_CHANNEL, INCREF, DECREF = "join", "channel", "incref", "decref"
 """First words of the notices to a server.  The values are part of the wire format."""
+
+Request: TypeAlias = tuple[str | None, str, tuple[Any, ...], dict[str, Any]]
+"""Id of an object, or None for the server, the name of a method, and its arguments."""
 
 _LOOK_AGAIN = 0.5
 """Seconds between checks that the server is alive, while it has not taken a new channel."""
 
 _FILES_AGAIN = 0.05
 """Seconds between attempts to receive a channel when this process may open no more files."""
-
-_ACQUIRING = ("acquire", "wait")
-"""Methods whose results are no objects of the user's."""
-
-_BEFORE_EXIT = -50
-"""Exit priority: after the managers of this process have been shut down."""
 
 
 class ManagerAddress(NamedTuple):
@@ -150,26 +145,24 @@ class ManagerSession:
         self.pid = os.getpid()
         self.process: weakref.ref[BaseProcess] | None = None
         """The server's process, if it is a child of this one."""
-        self._references = 0
+        self._locks: dict[str, Any] = {}
+        self._references: Counter[str] = Counter()
         self._ended = False
         self._notices: deque[tuple[str, ...]] = deque()
         self._of_thread: Any = util.ForkAwareLocal()
         try:
             listener = handles.channel(address.listener)
             try:
-                self._control = _open_channel(listener, JOIN, process_description())
+                self._control = _open_channel(listener, JOIN)
             finally:
                 listener.close()
         except (ConnectionClosed, BrokenPipeError) as error:
             raise self.closed_error() from error
 
-    def open_channel(self, holder: str) -> LocalChannel:
-        """Open a channel to a new thread of the server, which acts for the lock holder ``holder``.
-
-        All channels of one holder share the locks that they acquire.
-        """
+    def open_channel(self) -> LocalChannel:
+        """Open a channel to a new thread of the server."""
         try:
-            return _open_channel(self._control, OPEN_CHANNEL, thread_name(), holder)
+            return _open_channel(self._control, OPEN_CHANNEL, thread_name())
         except (ConnectionClosed, BrokenPipeError) as error:
             raise self.closed_error() from error
 
@@ -179,23 +172,13 @@ class ManagerSession:
             raise self.closed_error()
         channels: list[CallChannel] | None = getattr(self._of_thread, "channels", None)
         if channels is None:
-            self._of_thread.holder = new_holder()
             channels = self._of_thread.channels = []
         for channel in channels:
             if channel.is_free():
                 return channel
-        return self._new_channel()
-
-    def _new_channel(self) -> CallChannel:
-        channel = CallChannel(self.open_channel(self._of_thread.holder))
-        self._of_thread.channels.append(channel)
+        channel = CallChannel(self.open_channel())
+        channels.append(channel)
         return channel
-
-    def replace(self, channel: CallChannel) -> None:
-        """Replace a channel whose answer is not read.  This thread keeps its locks."""
-        with contextlib.suppress(ConnectionClosed):
-            self._new_channel()
-        self.give_up(channel)
 
     def give_up(self, channel: CallChannel) -> None:
         """Close a channel whose answer is not read."""
@@ -204,16 +187,21 @@ class ManagerSession:
         if channel in channels:
             channels.remove(channel)
 
-    def add_reference(self) -> None:
-        """Count a new reference to an object of the manager."""
-        self._references += 1
+    def add_reference(self, ident: str, *, lock: Any = None) -> None:
+        """Count a new reference to an object of the manager; keep the lock if it is one."""
+        self._references[ident] += 1
+        if lock is not None:
+            self._locks[ident] = lock
         _referenced[self.address] = self
 
     def drop_reference(self, ident: str) -> None:
         """Drop a reference to an object.  May be called from anywhere, also from a finalizer."""
         self.notify(DECREF, ident)
-        self._references -= 1
-        if self._references <= 0:
+        self._references[ident] -= 1
+        if self._references[ident] <= 0:
+            self._locks.pop(ident, None)
+            del self._references[ident]
+        if not self._references:
             _referenced.pop(self.address, None)
 
     def notify(self, *notice: str) -> None:
@@ -231,11 +219,18 @@ class ManagerSession:
             except OSError:  # the server has ended
                 return
 
-    def close(self) -> None:
-        """End the session in order.  The server does not release the locks of this process."""
-        _referenced.pop(self.address, None)
-        _sessions.pop(self.address, None)
-        self.notify(LEAVE)
+    def lock_of(self, request: Request) -> Any:
+        """Return the lock on which the client itself makes a call, or None."""
+        ident, method, _, _ = request
+        return self._locks.get(str(ident)) if method in primitives.METHODS else None
+
+    def call_lock(self, lock: Any, request: Request) -> Any:
+        """Make a call of a lock without the server."""
+        _, method, args, kwds = request
+        # A lock that is held when the manager ends has to be released all the same.
+        if method != "release" and (self._ended or self._control.poll(0)):
+            raise self.closed_error()
+        return primitives.call(lock, method, args, kwds)
 
     def end(self) -> None:
         """Close all channels: the server has ended, or this process is a fork of their owner."""
@@ -243,10 +238,6 @@ class ManagerSession:
         self._control.close()
         for channel in getattr(self._of_thread, "channels", []):
             channel.close()
-
-    def __del__(self) -> None:
-        if hasattr(self, "_control") and self.pid == os.getpid():
-            self.notify(LEAVE)
 
     def closed_error(self) -> ConnectionClosed:
         """Return the error for a caller that finds the server's process ended."""
@@ -260,7 +251,7 @@ class Reference:
     def __init__(self, session: ManagerSession, ident: str) -> None:
         self._session = session
         self._ident = ident
-        session.add_reference()
+        session.add_reference(ident)
         session.notify(INCREF, ident)
 
     def __del__(self) -> None:
@@ -307,7 +298,8 @@ class ManagerConnection:
     def __init__(self, address: ManagerAddress) -> None:
         self._address = address
         self._opened: ManagerSession | None = None
-        self._calls: list[tuple[CallChannel, str, str | None]] = []
+        self._calls: list[tuple[Any, Request]] = []
+        """Channels of the calls in progress, or their locks."""
 
     @property
     def _session(self) -> ManagerSession:
@@ -315,13 +307,19 @@ class ManagerConnection:
             self._opened = session(self._address)
         return self._opened
 
-    def send(self, request: tuple[str | None, str, tuple[Any, ...], dict[str, Any]]) -> None:
+    def send(self, request: Request) -> None:
         """Begin a call of an object's method, or of the server's own if the id is None."""
         ident, method, args, _ = request
+        if ident is None and method == "accept_connection":
+            return  # this thread gets its channel with its first call
         if ident is None and method == "decref":
             known = _sessions.get(self._address)
             if known is not None:  # a finalizer may call this, so it must not wait
                 known.drop_reference(*args)
+            return
+        lock = self._session.lock_of(request)
+        if lock is not None:
+            self._calls.append((lock, request))
             return
         channel = self._session.free_channel()
         channel.busy = True
@@ -334,15 +332,17 @@ class ManagerConnection:
             channel.busy = False
             raise reduction.blame({f"the arguments of {method}()": request}, error) from error
         except BaseException:
-            self._session.replace(channel)  # the request may have been sent or not
+            self._session.give_up(channel)  # the request may have been sent or not
             raise
-        self._calls.append((channel, method, ident))
+        self._calls.append((channel, request))
 
     def recv(self) -> tuple[str, Any]:
         """Return how the last call ended."""
         if not self._calls:
-            return "#RETURN", None  # a decref has no answer
-        channel, method, ident = self._calls.pop()
+            return "#RETURN", None  # the last request was not for the server
+        channel, request = self._calls.pop()
+        if not isinstance(channel, CallChannel):
+            return "#RETURN", self._session.call_lock(channel, request)
         try:
             kind, result = channel.answer()
         except ConnectionClosed as error:
@@ -353,31 +353,23 @@ class ManagerConnection:
         except BaseException as error:
             # An answer that came and does not unpickle is the caller's.  Any other error is raised
             # by a signal's handler.
-            if method in _ACQUIRING or not (channel.answered and isinstance(error, Exception)):
+            if not (channel.answered and isinstance(error, Exception)):
                 channel.take_back()
             raise
         finally:
             channel.busy = False
-        return self._interpret(kind, result, method, ident)
+        return self._interpret(kind, result, request)
 
-    def _interpret(self, kind: str, result: Any, method: str, ident: str | None) -> tuple[str, Any]:
+    def _interpret(self, kind: str, result: Any, request: Request) -> tuple[str, Any]:
+        ident, method, args, _ = request
         if kind == "#PROXY":
             return "#RETURN", proxy_of(self._session, *result)
-        if kind == "#WARNING":
-            text, acquired = result
-            self._warn(text, ident)
-            return "#RETURN", acquired
-        if kind == "#RETURN" and ident is None and method in ("create", "incref"):
-            self._session.add_reference()
+        if kind == "#RETURN" and ident is None:
+            if method == "create":
+                self._session.add_reference(result[0])
+            elif method == "incref":
+                self._session.add_reference(*args, lock=result)
         return kind, result
-
-    def _warn(self, text: str, ident: str | None) -> None:
-        try:
-            warnings.warn(text, RuntimeWarning, stacklevel=6)
-        except BaseException:  # a filter made it an error, so the lock is not acquired
-            self.send((ident, "release", (), {}))
-            self.recv()
-            raise
 
     def close(self) -> None:
         """Do nothing: the thread keeps its channels."""
@@ -396,7 +388,6 @@ def session(address: ManagerAddress) -> ManagerSession:
     if found is None:
         made = ManagerSession(address)
         found = _sessions.setdefault(address, made)  # another thread may have been faster
-        _close_at_exit()
     return found
 
 
@@ -415,7 +406,7 @@ def proxy_of(session: ManagerSession, make: Any, token: Token, exposed: tuple[st
     """
     from fiber._managers import SERIALIZER
 
-    session.add_reference()
+    session.add_reference(str(token.id))
     try:
         return make(token, SERIALIZER, exposed=exposed)
     finally:
@@ -430,38 +421,10 @@ def forget(address: ManagerAddress) -> None:
         session.end()
 
 
-_holders = itertools.count()
-
-
-def new_holder() -> str:
-    """Return the name of a new lock holder, for the servers that this process uses."""
-    return str(next(_holders))
-
-
-def process_description() -> str:
-    """Return a description of this process."""
-    return f"process {current_process().name!r} (pid {os.getpid()} on host {host()!r})"
-
-
 def thread_name() -> str:
     """Return the name of this thread, for the threads of the server."""
     name = current_process().name
     return name if current_thread() is main_thread() else f"{name}|{current_thread().name}"
-
-
-_closing_in = 0
-
-
-def _close_at_exit() -> None:
-    global _closing_in
-    if _closing_in != os.getpid():
-        _closing_in = os.getpid()
-        util.Finalize(None, _close_all, exitpriority=_BEFORE_EXIT)
-
-
-def _close_all() -> None:
-    for one in list(_sessions.values()):
-        one.close()
 
 
 def _after_fork() -> None:

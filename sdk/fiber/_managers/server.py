@@ -1,8 +1,7 @@
 """A manager's server: multiprocessing's, with another listener, and a record of its clients.
 
-Each thread of a client has a thread in the server, as in multiprocessing.  So the thread that
-acquired an RLock is the one that may release it.  The server counts the references of each process,
-and drops them when the process ends.
+Each thread of a client has a thread in the server, as in multiprocessing.  The server counts the
+references of each process, and drops them when the process ends.
 """
 
 from __future__ import annotations
@@ -11,10 +10,13 @@ import itertools
 import os
 import sys
 import threading
-from contextlib import suppress
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from multiprocessing import managers as mp_managers
 from multiprocessing.managers import Token
 from multiprocessing.process import current_process
+from queue import Queue
 from traceback import format_exc
 from typing import Any
 
@@ -23,10 +25,10 @@ from fiber._agent.exception_pickles import PickledException
 from fiber._hub.handles import GrantSet
 from fiber._hub.local import LocalChannel
 from fiber._hub.protocol import ObjectKind
+from fiber._managers import primitives
 from fiber._managers.client import (
     DECREF,
     INCREF,
-    LEAVE,
     NUMBER,
     OPEN_CHANNEL,
     TAKE_BACK,
@@ -34,7 +36,6 @@ from fiber._managers.client import (
     TravellingToken,
     receive_notice,
 )
-from fiber._managers.locks import CONTENDED, Client, ClientThread, LockTable
 from fiber._transport.channels import Channel
 from fiber._wire import packet
 from fiber._wire.packet import Message
@@ -44,6 +45,9 @@ _mp: Any = mp_managers  # typeshed has part of it
 
 _PROXY = b"RebuildProxy"
 """Bytes in every pickle that has a proxy in it."""
+
+_Taken = tuple[Queue[Any], Any]
+"""A queue, and an item of it."""
 
 _Answer = tuple[str, Any]
 """Kind of an answer, in multiprocessing's words, and its value."""
@@ -62,15 +66,53 @@ class ManagerListener:
             handle,
         )
 
-    def accept(self) -> tuple[str, str, Channel]:
-        """Return the next client: the notice's first word, its name, and its control channel."""
-        notice: tuple[str, str, Channel] = receive_notice(self._inbox)
-        return notice
+    def accept(self) -> Channel:
+        """Return the control channel of the next client."""
+        control: Channel
+        _, control = receive_notice(self._inbox)
+        return control
 
     def close(self) -> None:
         """Admit no more clients."""
         self._grants.release()
         self._inbox.close()
+
+
+class Client:
+    """Process that uses the manager."""
+
+    def __init__(self) -> None:
+        self.ended = False
+        self.references: Counter[str] = Counter()
+        self.mutex = threading.Lock()
+        self.barriers: list[threading.Barrier] = []
+        """Barriers at which threads of the client wait."""
+
+    @contextmanager
+    def waiting_at(self, obj: object) -> Iterator[None]:
+        """Note a call of a barrier, which is broken if the client dies in it."""
+        if not isinstance(obj, threading.Barrier):
+            yield
+            return
+        self.barriers.append(obj)
+        try:
+            yield
+        finally:
+            self.barriers.remove(obj)
+
+
+class ClientThread:
+    """Thread of the server that acts for one thread of a client."""
+
+    def __init__(self) -> None:
+        self.taken: _Taken | None = None
+        """Item that the last call has taken."""
+        self.kept: Any = None
+        """Last result that has proxies in it.
+
+        It keeps their objects until the client has its own references.  The client has them when
+        it makes the next call.
+        """
 
 
 class Server(_mp.Server):  # type: ignore[misc]
@@ -80,7 +122,6 @@ class Server(_mp.Server):  # type: ignore[misc]
         super().__init__(*options)
         self.stop_event = threading.Event()
         self._numbers = itertools.count(1)
-        self._locks = LockTable()
 
     def serve_forever(self) -> None:
         """Serve until ``shutdown`` is called, then end the process."""
@@ -95,10 +136,10 @@ class Server(_mp.Server):  # type: ignore[misc]
         """Start a thread for each client that connects."""
         while True:
             try:
-                _, name, control = self.listener.accept()
+                control = self.listener.accept()
             except (OSError, ConnectionClosed):  # the listener is closed
                 return
-            _start(self._serve_client, Client(name), control)
+            _start(self._serve_client, Client(), control)
 
     # A client
 
@@ -121,11 +162,11 @@ class Server(_mp.Server):  # type: ignore[misc]
                 self.incref(client, *values)
         elif notice == DECREF:
             self.decref(client, *values)
-        elif notice == LEAVE:
-            client.closed_in_order = True
 
     def _end_client(self, client: Client) -> None:
-        self._locks.end(client)
+        client.ended = True
+        for barrier in list(client.barriers):
+            barrier.abort()
         with client.mutex:
             references = list(client.references.elements())
             client.references.clear()
@@ -134,9 +175,9 @@ class Server(_mp.Server):  # type: ignore[misc]
 
     # A thread of a client
 
-    def _serve_channel(self, client: Client, name: str, holder: str, channel: Channel) -> None:
+    def _serve_channel(self, client: Client, name: str, channel: Channel) -> None:
         threading.current_thread().name = name
-        thread = ClientThread(self._locks, client, holder)
+        thread = ClientThread()
         try:
             channel.send(b"")
             while True:
@@ -145,7 +186,6 @@ class Server(_mp.Server):  # type: ignore[misc]
             pass
         finally:
             channel.close()
-            thread.end()
 
     def _serve_call(
         self, client: Client, thread: ClientThread, channel: Channel, message: Message
@@ -153,14 +193,14 @@ class Server(_mp.Server):  # type: ignore[misc]
         (number,) = NUMBER.unpack_from(message.payload)
         message.payload = message.payload[NUMBER.size :]
         ident, method = None, ""
-        previous, thread.last_result = thread.last_result, None
+        previous, thread.taken = thread.taken, None
         answer: _Answer
         try:
             ident, method, args, kwds = packet.loads(message)
             if ident is not None:
                 answer = self._call(client, thread, ident, method, args, kwds)
             elif method == TAKE_BACK:
-                thread.take_back(previous)
+                _put_back(previous)
                 answer = "#RETURN", None
             else:
                 answer = self._call_server(client, method, args, kwds)
@@ -169,7 +209,7 @@ class Server(_mp.Server):  # type: ignore[misc]
         try:
             return _reply(channel, number, answer)
         except BrokenPipeError:  # the client has ended, or does not wait for the answer
-            thread.take_back(thread.last_result)
+            _put_back(thread.taken)
             return None
         finally:
             if ident is None and method == "shutdown":
@@ -183,7 +223,7 @@ class Server(_mp.Server):  # type: ignore[misc]
     def _call(
         self, client: Client, thread: ClientThread, ident: str, method: str, args: Any, kwds: Any
     ) -> _Answer:
-        obj, exposed, typeids = self._look_up(ident)
+        obj, exposed, typeids, _ = self._look_up(ident)
         function = getattr(obj, method, None) if method in exposed else None
         if function is None:
             fallback = self.fallback_mapping.get(method)
@@ -193,9 +233,10 @@ class Server(_mp.Server):  # type: ignore[misc]
                 )
             return "#RETURN", fallback(self, client, ident, obj, *args, **kwds)
         try:
-            if isinstance(obj, CONTENDED):
-                return thread.call(obj, method, function, args, kwds)
-            result = function(*args, **kwds)
+            with client.waiting_at(obj):
+                result = function(*args, **kwds)
+            if method == "get" and type(obj) is Queue:
+                thread.taken = obj, result
         except BaseException as error:  # SystemExit too: the caller waits for an answer
             return _error_answer(error)
         if typeids and method in typeids:
@@ -220,7 +261,8 @@ class Server(_mp.Server):  # type: ignore[misc]
         self, c: Any, typeid: str, /, *args: Any, **kwds: Any
     ) -> tuple[str, tuple[str, ...]]:
         """Make an object; return its id and the names of its methods."""
-        make, exposed, typeids, _ = self.registry[typeid]
+        make, exposed, typeids, proxytype = self.registry[typeid]
+        make = primitives.maker(make, proxytype)
         if make is not None:
             obj = make(*args, **kwds)
         elif kwds or len(args) != 1:
@@ -233,21 +275,24 @@ class Server(_mp.Server):  # type: ignore[misc]
         # No ``id(obj)``: another object may have the same while this one is being dropped.
         ident = format(next(self._numbers), "x")
         with self.mutex:
-            self.id_to_obj[ident] = (obj, frozenset(names), typeids)
+            is_lock = primitives.is_lock(obj, proxytype)
+            self.id_to_obj[ident] = (obj, frozenset(names), typeids, is_lock)
             self.id_to_refcount[ident] = 0
         self.incref(c, ident)
         return ident, names
 
-    def incref(self, c: Any, ident: str) -> None:
-        """Count one more reference of the client."""
+    def incref(self, c: Any, ident: str) -> Any:
+        """Count one more reference of the client.  Return the object if it is a lock."""
         with self.mutex:
             if ident not in self.id_to_refcount:
                 raise _no_object(ident)
             self.id_to_refcount[ident] += 1
+            obj, _, _, is_lock = self.id_to_obj[ident]
         with c.mutex:
             c.references[ident] += 1
         if c.ended:
             self._end_client(c)
+        return obj if is_lock else None
 
     def decref(self, c: Any, ident: str) -> None:
         """Count one reference of the client less."""
@@ -266,11 +311,17 @@ class Server(_mp.Server):  # type: ignore[misc]
             last = self.id_to_obj.pop(ident)
         del last  # without the mutex: it may hold proxies, whose end drops other objects
 
-    def accept_connection(self, c: Any, name: str) -> None:
-        """Do nothing: the client's thread has its channel already."""
-
     def shutdown(self, c: Any) -> None:
         """End the process, once this call is answered."""
+
+
+def _put_back(taken: _Taken | None) -> None:
+    """Put back an item that the client does not get, so that other clients can have it."""
+    if taken is not None:
+        queue, item = taken
+        with queue.mutex:
+            queue.queue.appendleft(item)
+            queue.not_empty.notify()
 
 
 def _start(target: Any, *args: Any) -> None:

@@ -20,7 +20,8 @@ from typing import Protocol
 from fiber._sync import liveness
 from fiber._sync.semaphore import SLICE, SharedBlock, make_semaphore, semaphore_at
 
-WAIT_LIST_SIZE = 1 << 15
+WAIT_LIST_SIZE = (1 << 16) - 64
+"""Bytes of a wait list of a thousand places.  One more step, and each had a segment to itself."""
 
 # Words of 8 bytes
 _TICKET = 0
