@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import json
 import signal
+from pathlib import Path
 
 import pytest
 
-from e2e.kube import Body
+from e2e.accounts import kubeconfig_of
+from e2e.clusters import find_program
+from e2e.kube import Body, run
 from e2e.leftovers import leaves_nothing
 from e2e.pools import says
 from e2e.program import Programs
 from e2e.scene import Scene
+from e2e.test_drain import squares
 from e2e.test_program import workers
 
 pytestmark = pytest.mark.timeout(240, func_only=True)
@@ -73,6 +77,24 @@ def test_a_pod_without_rights_gets_no_word_of_a_program(
     scene.kube.delete(scene.path("pods", "stranger"))
     program.interrupt()
     program.ends(-signal.SIGINT)
+    leaves_nothing(program)
+
+
+def test_a_neighbour_changes_and_deletes_the_pool_of_a_program(
+    programs: Programs, scene: Scene, tmp_path: Path
+) -> None:
+    """A known limit: the role fiber-user is for one namespace, not for one pool."""
+    program = programs.start("outside", "mapping.py", "--tasks", 100, "--seconds", 0.2)
+    program.says("first")
+    (pool,) = scene.now["fiberpools"]
+    config = kubeconfig_of(scene, tmp_path)
+    neighbour = (find_program("kubectl"), "--kubeconfig", config, "--namespace", scene.namespace)
+    change = json.dumps({"spec": {"template": {"metadata": {"labels": {"from": "neighbour"}}}}})
+    run(*neighbour, "patch", "fiberpool", pool, "--type=merge", "--patch", change)
+    run(*neighbour, "delete", "fiberpool", pool, "--wait=false")
+    program.prints(f"the FiberPool {pool!r} in namespace {scene.namespace!r} was deleted")
+    assert program.says("done", seconds=90)["total"] == squares(100)
+    program.ends()
     leaves_nothing(program)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import re
 import signal
@@ -21,7 +22,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from fakes import virtual_time
 from fakes.kubernetes_api import Fault
 from fakes.world import NAMESPACE, OWN_LEASE, Test, World, a_world
-from fiber_operator.health import Health, WatchStatus
+from fiber_operator.health import MOST_CONNECTIONS, Health, WatchStatus
 from fiber_operator.metrics import Metrics, PoolSample
 from fiber_operator.planning.pods import PodState
 from fiber_operator.workqueue import QueueStatistics
@@ -193,6 +194,35 @@ async def test_metrics_count_calls_reconciles_and_pools(world: World) -> None:
     assert found["fiber_pool_problems", NAMESPACE, "es", "ContainerFailed"] == 1
     assert found["fiber_pool_lost_pods_total", "failed", NAMESPACE, "es"] == 1
     assert found["process_resident_memory_bytes",] > 0
+
+
+@played
+async def test_a_page_of_metrics_is_made_at_most_once_a_second(world: World) -> None:
+    world.make_pool(replicas=1)
+    await world.ready(1)
+    await world.settled(2)
+    wanted = ("fiber_pool_desired_pods", NAMESPACE, "es")
+    assert (await metrics(world))[wanted] == 1
+    world.edit(replicas=2)
+    await world.settled(0.5)
+    assert (await metrics(world))[wanted] == 1
+    await world.settled(1)
+    assert (await metrics(world))[wanted] == 2
+
+
+@played
+async def test_many_silent_connections_are_ended_and_probes_are_answered(world: World) -> None:
+    async with contextlib.AsyncExitStack() as there:
+        readers = []
+        for _ in range(3 * MOST_CONNECTIONS):
+            reader, writer = await asyncio.open_connection("127.0.0.1", world.program.port)
+            there.callback(writer.close)
+            readers.append(reader)
+        assert await ask(world, "/healthz") == (200, "ok")
+        await world.settled()
+        ended = [reader.at_eof() or reader.exception() is not None for reader in readers]
+    assert ended.count(False) <= MOST_CONNECTIONS
+    assert not any(ended[-MOST_CONNECTIONS // 2 :]), "the latest ones go on"
 
 
 @played
