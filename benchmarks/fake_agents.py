@@ -105,7 +105,7 @@ class FakeChild:
         self._agent.loop.call_soon(self._run, work.SEQ.pack(seq) + bytes(payload), list(buffers))
         return True
 
-    def lend(self) -> None:
+    def lease_channel(self) -> None:
         """Do nothing: the loop brings the answers."""
 
     def reclaim(self) -> None:

@@ -466,7 +466,7 @@ def test_the_end_of_a_pipe_names_the_end_of_the_pod(cluster: FakeCluster) -> Non
         assert ours.recv() == "ready"
         (victim,) = pods_of(cluster)
         cluster.do(cluster.world.store.delete, "pods", "lab", victim)
-        with pytest.raises(EOFError, match=f"Deleted: somebody deleted the pod, in pod {victim}"):
+        with pytest.raises(EOFError, match=f"Deleted: the pod was deleted, in pod {victim}"):
             ours.recv()
         child.join(PATIENCE)
         assert child.exitcode == -signal.SIGKILL  # after the grace of its pod

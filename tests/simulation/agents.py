@@ -181,7 +181,7 @@ class Child:
         self.agent.down.send(self._put, seq, payload, buffers)
         return True
 
-    def lend(self) -> Any:
+    def lease_channel(self) -> Any:
         """Return its channel, for direct use."""
         if self.gone:
             return None

@@ -144,7 +144,7 @@ class FakeChild:
     def signal(self, signum: int) -> None:
         self.signals.append(signum)
 
-    def lend(self) -> None:
+    def lease_channel(self) -> None:
         """Do nothing: no caller uses it directly."""
 
     def reclaim(self) -> None:

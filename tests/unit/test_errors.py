@@ -170,7 +170,7 @@ def test_worker_died_names_pod_and_node() -> None:
         ("Evicted: The node was low on resource: memory", "@fiber.meta(memory=, cpu=)"),
         ("Preempted", "priorityClassName"),
         ("NodeLost: node-2", "look at the node"),
-        ("Deleted: somebody deleted the pod", "who deletes the pods"),
+        ("Deleted: the pod was deleted", "who deletes the pods"),
         ("killed by SIGKILL", "the kernel, out of memory"),
     ],
 )

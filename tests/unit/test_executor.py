@@ -422,7 +422,7 @@ def test_a_call_that_a_recall_took_from_a_leased_worker_is_sent_again(rig: Rig) 
             return self.done
 
     for handle, child in zip(rig.handles, rig.children, strict=True):
-        child.lend = partial(Recalled, handle)  # type: ignore[assignment,method-assign]
+        child.lease_channel = partial(Recalled, handle)  # type: ignore[assignment,method-assign]
     for _ in range(2):  # the first one's answer leads to a lease of its worker
         assert rig.executor.call_and_wait(Awaited(), tasks.square, (3,), {}) == 1
     assert len(list(rig.deliveries())) == 2, "the second call was not sent again"

@@ -84,10 +84,10 @@ KILLED = {"exitCode": 137, "reason": "OOMKilled"}
             "NodeLost: its node has no record of the container",
             None,
         ),
-        (pod(deleted=True), "Deleted: somebody deleted the pod", None),
+        (pod(deleted=True), "Deleted: the pod was deleted", None),
         (
             pod(deleted=True, terminated={"exitCode": 0, "reason": "Completed"}),
-            "Deleted: somebody deleted the pod",
+            "Deleted: the pod was deleted",
             0,
         ),
         (

@@ -52,7 +52,7 @@ def test_an_agent_speaks_for_no_child_of_another(message: messages.LinkMessage) 
 
 def test_a_child_without_memory_on_a_pod_that_is_deleted_ended_by_its_own_doing() -> None:
     agent, (observer,) = agent_with_children("far", 1)
-    agent.ending, agent.disrupted = "Deleted: somebody deleted the pod", True
+    agent.ending, agent.disrupted = "Deleted: the pod was deleted", True
     said = messages.Exited(1, 0, -signal.SIGKILL, "OOMKilled: the limit is 1 GiB", (), None, ())
     agent.on_frame(bytearray(said.encode()))
     report = observer.report

@@ -60,7 +60,7 @@ def word(message: Message | None) -> Any:
 
 
 def test_a_leased_worker_answers_its_caller(far: Far) -> None:
-    channel = far.child.lend()
+    channel = far.child.lease_channel()
     assert channel is not None
     channel.send(7, b"call")
     assert far.sent() == [7]
@@ -80,7 +80,7 @@ def _ends(far: Far) -> None:
 
 @pytest.mark.parametrize("event", [_says, _ends])
 def test_a_waiting_caller_is_woken(far: Far, event: Callable[[Far], None]) -> None:
-    channel = far.child.lend()
+    channel = far.child.lease_channel()
     assert channel is not None
     heard: list[Any] = []
 
@@ -100,7 +100,7 @@ def test_a_waiting_caller_is_woken(far: Far, event: Callable[[Far], None]) -> No
 
 
 def test_an_answer_that_the_caller_did_not_receive_goes_to_the_observer(far: Far) -> None:
-    channel = far.child.lend()
+    channel = far.child.lease_channel()
     assert channel is not None
     channel.send(7, b"call")
     far.says("late answer")
@@ -110,7 +110,7 @@ def test_an_answer_that_the_caller_did_not_receive_goes_to_the_observer(far: Far
 
 
 def test_an_answer_comes_before_the_end(far: Far) -> None:
-    channel = far.child.lend()
+    channel = far.child.lease_channel()
     assert channel is not None
     channel.send(7, b"call")
     assert far.sent() == [7]
@@ -124,7 +124,7 @@ def test_an_answer_comes_before_the_end(far: Far) -> None:
 
 
 def test_a_call_that_the_worker_did_not_get_is_reported_as_unread(far: Far) -> None:
-    channel = far.child.lend()
+    channel = far.child.lease_channel()
     assert channel is not None
     channel.send(7, b"call")
     assert far.sent() == [7]
@@ -147,7 +147,7 @@ def test_the_remembered_packets_of_a_lost_child_are_named_as_unread(
 
 
 def test_a_call_that_was_not_sent_raises_a_broken_pipe_error(far: Far) -> None:
-    channel = far.child.lend()
+    channel = far.child.lease_channel()
     assert channel is not None
     channel.send(7, b"call")  # waits for the loop, which gets the end first
     far.ends(delivered=0)

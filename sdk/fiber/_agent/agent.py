@@ -405,7 +405,7 @@ class LocalChild:
         outbox = self._outbox
         return outbox is not None and outbox.send(b"".join((_SEQ.pack(seq), payload)), buffers)
 
-    def lend(self) -> LocalTaskChannel | None:
+    def lease_channel(self) -> LocalTaskChannel | None:
         """Return the task channel for direct use; None if it is gone, or without descriptors."""
         if self._ours is None or self._ours.fileno() < 0:
             return None
@@ -421,7 +421,7 @@ class LocalChild:
         return LocalTaskChannel(sock, self.abort)
 
     def reclaim(self) -> None:
-        """Receive the child's packets again, after ``lend``."""
+        """Receive the child's packets again, after ``lease_channel``."""
         self._in_direct_use = False
         self.resume()
 
@@ -491,7 +491,7 @@ class LocalChild:
     def _receive(self) -> None:
         if (
             not self._in_direct_use
-        ):  # an event from before ``lend``: its packet is for the channel's user
+        ):  # an event from before ``lease_channel``: its packet is for the channel's user
             self._hear()
 
     def _hear(self) -> bool:

@@ -179,7 +179,7 @@ class ChildHandle(Protocol):
         False: the child is gone and never got the packet.  ``ExitReport.unread`` does not name it.
         """
 
-    def lend(self) -> DirectChannel | None:
+    def lease_channel(self) -> DirectChannel | None:
         """Return the task channel for direct use by one thread at a time, until ``reclaim``.
 
         None: the child is gone, or its channel cannot be used directly.  Until ``reclaim`` the

@@ -320,7 +320,7 @@ class RemoteChild:
         self._agent.transmit(messages.Deliver(self._number, seq, payload, buffers))
         return True
 
-    def lend(self) -> RemoteTaskChannel | None:
+    def lease_channel(self) -> RemoteTaskChannel | None:
         """Return the task channel for direct use; None if the child has ended."""
         if self._gone:
             return None

@@ -182,7 +182,7 @@ class Leases:
             return
         if not self._scheduler.lease(handle.worker):
             return
-        channel = handle.child.lend()
+        channel = handle.child.lease_channel()
         if channel is None:
             self._scheduler.return_idle(handle.worker, self._loop.now())
             return

@@ -308,7 +308,7 @@ def _disruption(pod: Mapping[str, Any]) -> str | None:
 def _deletion(pod: Mapping[str, Any]) -> str | None:
     if not (pod.get("metadata") or {}).get("deletionTimestamp"):
         return None
-    return "Deleted: somebody deleted the pod"
+    return "Deleted: the pod was deleted"
 
 
 def _lost_container(worker: Mapping[str, Any]) -> str | None:
