@@ -53,7 +53,7 @@ def row(name: str, problem: str, *pods: Json, pool: FiberPool = POOL, **seen: An
     """Return a pool, its pods, what the operator knows, and the only problem of its status.
 
     The problem is written as its reason, its severity, and ``terminal`` if it is.  Parts of its
-    message follow; those after ``not`` are absent.
+    message follow; those after ``not`` are absent, and ``(end)`` is its end.
     """
     return pytest.param(pool, pods, seen, problem, id=name)
 
@@ -155,7 +155,7 @@ FAIL = [
     row(
         "exit-code",
         f"ContainerFailed Error; {name_of(1)} exited with code 3 after 12 s; "
-        "Traceback:\nKeyError: 'x'",
+        "Traceback:\nKeyError: 'x' (end)",
         ended(1, code=3, ran=12, message="Traceback:\nKeyError: 'x'"),
     ),
     row(
@@ -214,7 +214,7 @@ FAIL = [
         row(
             f"gone-{number}",
             f"ContainerFailed Error; A worker failed{known}, and its pod is gone. See the events "
-            "of the pool with kubectl describe fiberpool es.",
+            "of the pool with kubectl describe fiberpool es. (end)",
             pool=counted(waves=2, **failures),
         )
         for number, (known, failures) in enumerate(
@@ -301,7 +301,7 @@ def test_the_status_has_one_problem(
     (found,) = status_of(pool, *pods, **seen).problems
     kind, *parts = expected.split("; ")
     assert f"{found.reason} {found.severity}{' terminal' * found.terminal}" == kind
-    text = f"{found.count} pods, of {found.pod}: {found.message}"
+    text = f"{found.count} pods, of {found.pod}: {found.message} (end)"
     for part in parts:
         unsaid = part.startswith("not ")
         assert (part.removeprefix("not ") in text) is not unsaid
