@@ -214,16 +214,6 @@ async def test_a_template_gets_one_dry_run(world: World) -> None:
 
 
 @played()
-async def test_released_pods_go_and_no_other(world: World) -> None:
-    world.make_pool(replicas=5, master=MASTER)
-    await world.ready(5)
-    released, kept = world.names()[:2], world.names()[2:]
-    world.edit(replicas=3, scaleDown={"release": released})
-    await world.ready(3)
-    assert world.names() == kept
-
-
-@played()
 async def test_the_status_keeps_up_with_a_long_deletion(world: World) -> None:
     world.make_pool(replicas=400)
     await world.ready(400)
@@ -391,46 +381,6 @@ def test_an_invalid_spec_deletes_no_pod(spec: Body) -> None:
         assert world.status()["readyReplicas"] == 3
         world.edit(template=TEMPLATE, replicas=4, minReplicas=0, maxReplicas=9)
         await world.ready(4)
-
-    test()
-
-
-@pytest.mark.parametrize(
-    "status",
-    [
-        "text",
-        {"failures": "many", "problems": [1, {}], "conditions": {"a": 1}, "replicas": -1},
-        {"failures": {"consecutive": "x", "counted": 7}, "problems": None, "phase": []},
-    ],
-)
-def test_nonsense_in_the_status_is_written_over(status: Any) -> None:
-    @played()
-    async def test(world: World) -> None:
-        world.make_pool(replicas=3)
-        await world.ready(3)
-        world.store.set_status("fiberpools", NAMESPACE, "es", status)
-        world.kubelet.evict(NAMESPACE, world.names()[0])
-        await world.until(
-            lambda: isinstance(world.status(), dict) and world.status().get("phase") == "Ready", 125
-        )
-        await world.ready(3)
-        assert len(world.created()) == 4
-
-    test()
-
-
-@pytest.mark.parametrize(
-    "status", [{}, {"phase": 7, "conditions": "x"}, {"containerStatuses": [None, {"state": 1}]}]
-)
-def test_nonsense_in_a_pod_harms_no_other(status: Any) -> None:
-    @played()
-    async def test(world: World) -> None:
-        world.make_pool(replicas=3, master=MASTER)
-        await world.ready(3)
-        world.store.set_status("pods", NAMESPACE, world.names()[0], status)
-        await world.settled(120)
-        assert world.api.count("delete", "pods") == 0
-        assert len(world.created()) == 3
 
     test()
 

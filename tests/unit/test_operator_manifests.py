@@ -99,7 +99,3 @@ def test_the_secret_holds_the_given_data() -> None:
     body = manifests.secret(make_pool(), {"ca.crt": "PEM"})
     assert body["metadata"]["name"] == "es-fiber-key"
     assert base64.b64decode(body["data"]["ca.crt"]) == b"PEM"
-
-
-def test_pods_are_selected_by_the_pools_uid() -> None:
-    assert manifests.selector(make_pool()) == f"fiber.dev/pool-uid={UID}"

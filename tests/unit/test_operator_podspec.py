@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from fiber_api import names
 from fiber_api.v1alpha1 import FiberPool
-from fiber_operator.planning.manifests import spec_hash, template_hash
+from fiber_operator.planning.manifests import template_hash
 from fiber_operator.planning.podspec import NODE_LOST_SECONDS, pod
 from unit.operator_objects import MASTER, UID, make_pool, pool_document
 from unit.test_operator_pods import ANYTHING
@@ -360,23 +360,6 @@ def test_nonsense_is_passed_on(spec: Json, container: Json, metadata: Json) -> N
     assert body["spec"]["restartPolicy"] == "Never"
     hidden = spec.get("hostNetwork")
     assert body["spec"].get("hostNetwork") == hidden or hidden != hidden
-
-
-def test_the_hash_is_of_the_users_words() -> None:
-    template = {"spec": {"containers": [{"image": "i", "name": "worker"}]}}
-    turned = {"spec": {"containers": [{"name": "worker", "image": "i"}]}}
-    first = template_hash(make_pool(template=template))
-    assert template_hash(make_pool(template=turned, replicas=9, master=MASTER)) == first
-    assert template_hash(make_pool(template=template, processesPerPod=2)) != first
-    assert len(first) == 16
-
-
-def test_fields_of_the_sdk_start_no_new_attempt() -> None:
-    first = spec_hash(make_pool(replicas=1))
-    release = {"release": ["es-0000000001"]}
-    assert spec_hash(make_pool(replicas=2, scaleDown=release, maxReplicas=9)) == first
-    for change in ({"suspend": True}, {"processesPerPod": 2}, {"master": MASTER}):
-        assert spec_hash(make_pool(**change)) != first
 
 
 # -- Requests that the template does not set

@@ -34,6 +34,8 @@ def test_the_hash_of_a_template_is_stable() -> None:
     """
     assert template_hash(make_pool(template=TEMPLATE)) == "869ab9037e805d3a"
     assert template_hash(make_pool(template=TEMPLATE, processesPerPod=8)) == "501ba82f4f5d6c63"
+    reordered = {name: TEMPLATE[name] for name in reversed(TEMPLATE)}
+    assert template_hash(make_pool(template=reordered)) == "869ab9037e805d3a"
 
 
 @pytest.mark.parametrize(
