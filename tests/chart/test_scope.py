@@ -115,7 +115,7 @@ def test_the_operator_may_write_its_serving_lease_where_programs_read_it(
     assert [rule["resourceNames"] for rule in role["rules"]] == [[SERVING_LEASE]]
 
 
-def test_namespaced_makes_no_cluster_object_except_the_resource_type(helm: Helm) -> None:
+def test_scope_namespaced_makes_no_cluster_object_except_the_resource_type(helm: Helm) -> None:
     assert CLUSTER_WIDE & set(kinds(helm.render(TWO))) == {"CustomResourceDefinition"}
     without = helm.render({**TWO, "crds": {"install": False}})
     assert CLUSTER_WIDE & set(kinds(without)) == set()

@@ -299,7 +299,7 @@ def test_a_status_is_written_as_it_is_read() -> None:
         ("localhost", False),
     ],
 )
-def test_a_masters_address_is_one_that_an_endpointslice_takes(host: str, good: bool) -> None:
+def test_an_endpointslice_accepts_the_address_of_a_master(host: str, good: bool) -> None:
     pool = changed(GOOD, {"spec.master": {**MASTER, "host": host}})
     if good:
         assert FiberPool.read(pool).spec.master is not None

@@ -23,7 +23,7 @@ SUFFIXES = st.text("0123456789abcdef", min_size=10, max_size=10)
 
 @settings(deadline=None)
 @given(POOLS, SUFFIXES)
-def test_every_name_made_from_a_pools_is_one_that_kubernetes_takes(pool: str, suffix: str) -> None:
+def test_kubernetes_accepts_each_name_made_from_a_pools(pool: str, suffix: str) -> None:
     assert names.check_pool_name(pool) == pool
     for name in (
         names.pod_name(pool, suffix),

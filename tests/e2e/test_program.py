@@ -109,7 +109,9 @@ def test_each_shape_has_separate_pods(programs: Programs, scene: Scene) -> None:
     leaves_nothing(program)
 
 
-def test_a_gpu_is_one_of_a_node_that_has_it(programs: Programs, cluster: Cluster) -> None:
+def test_a_process_with_a_gpu_runs_on_a_node_that_has_one(
+    programs: Programs, cluster: Cluster
+) -> None:
     scene = programs.scene
     node = cluster.workers()[-1]
     path = path_of("nodes", name=node, subresource="status")

@@ -165,7 +165,7 @@ def test_an_answer_that_cannot_be_handled_ends_its_worker(
     assert "ValueError: not this one" in capsys.readouterr().err
 
 
-def test_one_that_was_killed_before_it_was_born_is_gone_at_once(own: Agent, tmp_path: Path) -> None:
+def test_a_child_that_is_killed_before_its_fork_ends_at_once(own: Agent, tmp_path: Path) -> None:
     """Though its zygote imports the program's main module, for ever for all we know."""
     gate = tmp_path / "gate"
     os.mkfifo(gate)

@@ -267,7 +267,7 @@ def test_an_interruption_loses_no_other_result(
         first.get(PATIENCE)
 
 
-def test_it_serves_no_other_programs() -> None:
+def test_an_async_manager_serves_no_other_programs() -> None:
     with pytest.raises(ValueError, match="use BaseManager"):
         DeskManager(("127.0.0.1", 0))
     with pytest.raises(ValueError, match="use BaseManager"):

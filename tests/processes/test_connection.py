@@ -84,7 +84,7 @@ def test_anything_with_a_buffer_is_bytes() -> None:
         assert other.recv_bytes() == bytes(memoryview(thing).cast("B"))
 
 
-def test_too_long_a_message_closes_the_connection() -> None:
+def test_a_message_that_is_too_long_closes_the_connection() -> None:
     one, other = Pipe()
     one.send_bytes(b"12345")
     assert other.recv_bytes(5) == b"12345"
@@ -451,7 +451,7 @@ def test_listener_and_client_prove_to_each_other_that_they_know_the_key(
     assert len(errors) == 1
 
 
-def test_a_client_does_not_believe_a_listener_that_welcomes_everybody() -> None:
+def test_a_client_refuses_a_listener_that_accepts_any_key() -> None:
     with connection.Listener(("127.0.0.1", 0)) as listener:
 
         def welcome() -> None:

@@ -37,7 +37,7 @@ def register_and_end(path: Path, status: int) -> None:
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("status", [0, 3])
-def test_of_a_process(tmp_path: Path, method: Any, status: int) -> None:
+def test_exit_functions_of_a_process_run(tmp_path: Path, method: Any, status: int) -> None:
     notes = tmp_path / "notes"
     process = fiber.get_context(method).Process(target=register_and_end, args=(notes, status))
     process.start()
@@ -48,7 +48,7 @@ def test_of_a_process(tmp_path: Path, method: Any, status: int) -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_of_a_pool_worker(tmp_path: Path, method: Any) -> None:
+def test_exit_functions_of_a_pool_worker_run(tmp_path: Path, method: Any) -> None:
     notes = tmp_path / "notes"
     with fiber.get_context(method).Pool(1) as pool:
         pool.apply(register, (notes,))

@@ -406,7 +406,7 @@ def test_bad_options(options: Any, error: type[Exception], says: str) -> None:
         fiber.Executor(1).options(cpu=-1)
 
 
-def test_its_use_during_the_import_of_main_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_executor_is_refused_during_the_import_of_main(monkeypatch: pytest.MonkeyPatch) -> None:
     executor = fiber.Executor(1)
     monkeypatch.setattr(fiber.current_process(), "_inheriting", True, raising=False)
     with pytest.raises(RuntimeError, match='if __name__ == "__main__"'):
@@ -519,7 +519,7 @@ def test_a_copy_in_a_fork_says_so(executor: fiber.Executor) -> None:
         assert b"belongs to process" in read.read()
 
 
-def test_it_cannot_be_sent(executor: fiber.Executor) -> None:
+def test_an_executor_cannot_be_pickled(executor: fiber.Executor) -> None:
     with pytest.raises(NotImplementedError, match="cannot be passed"):
         pickle.dumps(executor)
 

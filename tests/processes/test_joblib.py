@@ -152,7 +152,7 @@ def test_loops_in_tasks() -> None:
         assert joblib.Parallel()(call(in_a_task)(n) for n in (2, 3)) == [[0, 1], [0, 1, 4]]
 
 
-def test_one_job_runs_here() -> None:
+def test_a_single_job_runs_in_this_process() -> None:
     with joblib.parallel_config(backend="fiber", n_jobs=1):
         assert joblib.Parallel()([call(os.getpid)()]) == [os.getpid()]
 

@@ -410,7 +410,7 @@ def test_an_address_of_another_host_is_named() -> None:
         pass
 
 
-def test_it_leaves_no_file(tmp_path: Any) -> None:
+def test_a_program_with_agents_leaves_no_file(tmp_path: Any) -> None:
     with running(runtime_directory=str(tmp_path)):
         stop(start())
         assert "key" not in " ".join(path.name for path in tmp_path.rglob("*"))

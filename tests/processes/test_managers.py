@@ -548,7 +548,7 @@ def test_an_initializer_that_raises_is_an_error_of_start(capfd: pytest.CaptureFi
         manager.start(3)  # type: ignore[arg-type]
 
 
-def test_it_starts_once_and_ends_for_good() -> None:
+def test_a_manager_cannot_be_started_twice_or_after_its_end() -> None:
     manager = SyncManager()
     manager.start()
     shared = manager.dict()
@@ -563,7 +563,7 @@ def test_it_starts_once_and_ends_for_good() -> None:
         shared["a"] = 1
 
 
-def test_one_that_is_collected_on_fibers_own_thread_ends_too() -> None:
+def test_a_manager_that_is_collected_on_the_loop_thread_ends_too() -> None:
     manager = SyncManager()
     manager.start()
     process = manager._process
@@ -572,7 +572,7 @@ def test_one_that_is_collected_on_fibers_own_thread_ends_too() -> None:
     assert process.exitcode == 0
 
 
-def test_its_process_has_the_wishes_of_its_class_and_callables() -> None:
+def test_the_process_of_a_manager_has_the_resources_of_its_class_and_callables() -> None:
     @fiber.meta(memory=512)
     class Manager(BaseManager):
         pass

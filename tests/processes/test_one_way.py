@@ -126,7 +126,9 @@ def test_a_pipe_holds_as_much_as_multiprocessings(size: int, duplex: bool) -> No
 
 
 @pytest.mark.parametrize("size", [1, 40, 1000])
-def test_so_does_a_simple_queue_of_another_host(size: int, far: Far) -> None:
+def test_a_simple_queue_of_another_host_holds_as_much_as_multiprocessings(
+    size: int, far: Far
+) -> None:
     count = held_by_multiprocessing(size, duplex=False)
     here: Any = fiber.SimpleQueue()
     there = far(here)
@@ -238,7 +240,9 @@ def test_a_receiver_that_slept_before_it_was_lost_wakes_all_the_same(ends: Ends)
 
 
 @pytest.mark.parametrize("sleep", ["recv", "poll", "wait"])
-def test_so_does_one_of_another_host(sleep: str, far: Far, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_reader_of_another_host_finds_an_unannounced_message(
+    sleep: str, far: Far, monkeypatch: pytest.MonkeyPatch
+) -> None:
     reader, writer = fiber.Pipe(duplex=False)
     there, sender = far(reader), writer._channel
     answers: list[object] = []
@@ -265,7 +269,7 @@ def test_so_does_one_of_another_host(sleep: str, far: Far, monkeypatch: pytest.M
         pass
 
 
-def test_so_does_the_dealer_of_a_queue() -> None:
+def test_the_dealer_of_a_queue_finds_an_unannounced_item() -> None:
     inbox, outbox = local.one_way_pair()
     arrivals, door = LocalChannel.pair()
     Dealer(inbox, arrivals).start()

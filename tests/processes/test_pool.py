@@ -69,7 +69,7 @@ def test_imap_unordered(pool: Pool, chunksize: int) -> None:
     assert sorted(found) == [x * x for x in range(40)]
 
 
-def test_none_is_a_result(pool: Pool) -> None:
+def test_none_may_be_a_result(pool: Pool) -> None:
     assert list(pool.imap(tasks.identity, [None, 1, None])) == [None, 1, None]
     assert pool.map(tasks.identity, [None] * 5) == [None] * 5
     assert pool.apply(tasks.identity, (None,)) is None

@@ -106,7 +106,7 @@ def test_a_result_that_cannot_even_be_shown(pool: Pool) -> None:
         pool.apply(tasks.unreprable_result)
 
 
-def test_callbacks_hear_of_results_that_do_not_travel(pool: Pool) -> None:
+def test_error_callbacks_get_the_error_of_an_unpicklable_result(pool: Pool) -> None:
     heard: list[Any] = []
     for x in (2, 3):
         result = pool.apply_async(tasks.odd_results, (x,), error_callback=heard.append)
@@ -126,9 +126,7 @@ def test_an_argument_that_does_not_pickle(pool: Pool, chunksize: int | None) -> 
 
 
 @pytest.mark.parametrize("source", [list, iter])
-def test_of_many_tasks_only_those_whose_arguments_do_not_pickle_fail(
-    pool: Pool, source: Any
-) -> None:
+def test_only_tasks_with_unpicklable_arguments_fail(pool: Pool, source: Any) -> None:
     pool.map(tasks.identity, range(1000))  # batches become large
     bad = {3, 200, 201, 499}
     items = [tasks.Unpicklable() if n in bad else n for n in range(500)]
@@ -138,9 +136,7 @@ def test_of_many_tasks_only_those_whose_arguments_do_not_pickle_fail(
 
 
 @pytest.mark.parametrize("chunksize", [1, 7])
-def test_of_many_tasks_only_those_whose_arguments_do_not_unpickle_fail(
-    pool: Pool, chunksize: int
-) -> None:
+def test_only_tasks_whose_arguments_do_not_unpickle_fail(pool: Pool, chunksize: int) -> None:
     pool.map(tasks.identity, range(1000))
     bad = {3, 200, 201, 499}
     items = [tasks.UnreadableInWorker() if n in bad else n for n in range(500)]
@@ -196,7 +192,7 @@ def test_objects_of_multiprocessing_are_refused_with_advice(pool: Pool, make: st
             call()
 
 
-def test_so_is_the_way_to_it(pool: Pool) -> None:
+def test_the_error_names_the_path_to_an_unpicklable_object(pool: Pool) -> None:
     with pytest.raises(UnpicklableError, match=r"\(at \['a'\]\[1\]\.lock\)"):
         pool.map(tasks.identity, [{"a": [1, SimpleNamespace(lock=threading.Lock())]}])
 

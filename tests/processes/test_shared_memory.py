@@ -65,7 +65,7 @@ def test_processes_find_it_by_name_and_as_an_argument(memory: SharedMemory) -> N
     assert bytes(memory.buf[:6]) == b"abcdef"
 
 
-def test_it_is_multiprocessings(memory: SharedMemory) -> None:
+def test_shared_memory_is_an_instance_of_multiprocessings_class(memory: SharedMemory) -> None:
     theirs = multiprocessing.shared_memory.SharedMemory
     assert isinstance(memory, theirs)
     memory.buf[0] = 5

@@ -148,7 +148,7 @@ def count_both(*values: Any) -> None:
         count_up(value, 1)
 
 
-def test_they_travel_through_queues_and_keep_their_lock() -> None:
+def test_arrays_travel_through_queues_and_keep_their_lock() -> None:
     there, back = fiber.Queue(), fiber.SimpleQueue()
     process = start(pass_on, there, back)
     array = fiber.Array("i", 2)

@@ -106,7 +106,7 @@ SPACES = {
 
 
 @pytest.mark.parametrize("space", SPACES)
-def test_it_gives_the_same_as_dummy_vec_env(space: str, vec_env: Make) -> None:
+def test_environments_give_the_same_as_dummy_vec_env(space: str, vec_env: Make) -> None:
     makes = [partial(Sampling, SPACES[space], length=3 + number % 3) for number in range(5)]
     play_both(vec_env(makes), dummy(makes))
 

@@ -97,7 +97,7 @@ def play_both(env: VectorEnv, sync: SyncVectorEnv, steps: int = 12) -> None:
 
 
 @pytest.mark.parametrize("space", SPACES)
-def test_it_gives_the_same_as_sync_vector_env(space: str, vector_env: Make) -> None:
+def test_environments_give_the_same_as_sync_vector_env(space: str, vector_env: Make) -> None:
     makes = [partial(Sampling, SPACES[space], length=3 + number % 3) for number in range(5)]
     play_both(vector_env(makes), SyncVectorEnv(makes))
 

@@ -287,7 +287,7 @@ class Flagged(Faulty):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("how", "error"), [("raise", ArithmeticError), ("die", fiber.WorkerDied)])
-def test_one_that_never_does_anything_again_is_given_up(
+def test_an_environment_that_never_answers_again_is_given_up(
     how: str, error: type[Exception], vector_env: Make, tmp_path: Path
 ) -> None:
     env = vector_env([partial(Flagged, tmp_path / "flag", how)] * 2, on_error="restart")
@@ -301,7 +301,7 @@ def test_one_that_never_does_anything_again_is_given_up(
         env.step([0, 0])
 
 
-def test_one_that_raises_again_and_again_and_works_between_is_not_given_up(
+def test_an_environment_that_works_between_its_errors_is_not_given_up(
     vector_env: Make,
 ) -> None:
     env = vector_env([Faulty] * 2, on_error="restart")
@@ -327,7 +327,7 @@ def test_a_making_that_hangs(vector_env: Make, tmp_path: Path) -> None:
 # Ends
 
 
-def test_one_that_the_collector_finds_in_fibers_own_thread(tmp_path: Path) -> None:
+def test_a_vector_env_that_is_collected_on_the_loop_thread_ends_its_workers(tmp_path: Path) -> None:
     env = VectorEnv([partial(Faulty, tmp_path / "never")] * 2, num_workers=2)
     env.reset()
     pids = env.call("pid")

@@ -139,7 +139,7 @@ def test_a_child_that_is_just_born_does_not_count_as_prepared_for_a_signal(maste
         ("pass", False),
     ],
 )
-def test_whether_a_process_is_prepared_for_a_signal(prepare: str, expected: bool) -> None:
+def test_is_expected_tells_whether_a_process_handles_a_signal(prepare: str, expected: bool) -> None:
     script = f"import signal, sys; {prepare}; print(flush=True); sys.stdin.read()"
     command = [sys.executable, "-c", script]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
@@ -195,7 +195,7 @@ def test_no_signal_of_the_terminal_ends_it(master: Master) -> None:
     assert not gone(first)
 
 
-def test_its_children_do_not_outlive_its_own_sudden_death(master: Master) -> None:
+def test_children_end_with_a_zygote_that_is_killed(master: Master) -> None:
     pids = [
         master.started(number, method=method) for number, method in enumerate(("fork", "spawn"))
     ]
@@ -212,7 +212,7 @@ def test_a_hang_up_ends_it(progress_table: ProgressTable) -> None:
 
 
 @pytest.mark.slow
-def test_it_ends_when_its_agent_does_though_someone_holds_its_socket() -> None:
+def test_a_zygote_ends_with_its_agent_although_another_process_holds_its_socket() -> None:
     script = """
         import os, signal, subprocess
         from processes.test_zygote import ProgressTable, Master
@@ -232,7 +232,7 @@ def test_it_ends_when_its_agent_does_though_someone_holds_its_socket() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("moment", ["at once", "later"])
-def test_it_removes_the_directory_of_an_agent_that_was_killed(moment: str, tmp_path: Path) -> None:
+def test_a_zygote_removes_the_directory_of_a_killed_agent(moment: str, tmp_path: Path) -> None:
     directory = tmp_path / "cleanup_directory"
     directory.mkdir()
     script = f"""
@@ -455,7 +455,7 @@ def test_untaken_descriptors_are_closed_in_the_child(
     os.close(reader)
 
 
-def test_its_socket_blocks_whatever_the_programs_default_timeout_is(
+def test_the_socket_of_a_zygote_blocks_in_spite_of_a_default_timeout(
     monkeypatch: pytest.MonkeyPatch, progress_table: ProgressTable
 ) -> None:
     blocking = []
@@ -479,7 +479,7 @@ def test_its_socket_blocks_whatever_the_programs_default_timeout_is(
 
 
 @pytest.mark.slow
-def test_one_that_was_started_early_is_the_next_one(progress_table: ProgressTable) -> None:
+def test_a_zygote_that_was_started_early_is_used_next(progress_table: ProgressTable) -> None:
     zygote_process.start_early()
     early = zygote_process._early
     assert early is not None
@@ -499,7 +499,7 @@ def test_an_unused_early_zygote_is_ended() -> None:
     assert census.read(pid) is None
 
 
-def test_one_that_was_started_early_ends_with_the_program() -> None:
+def test_an_early_zygote_ends_with_the_program() -> None:
     script = """
         import os
         from fiber._agent import zygote_process

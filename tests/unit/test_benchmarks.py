@@ -314,7 +314,7 @@ SUBMITTED = [("fiber-executor", 60e3), ("concurrent.futures", 10e3), ("loky", 5e
     ],
     ids=["ratio", "failure", "two-budgets", "baseline", "not-run", "idle", "busy"],
 )
-def test_a_page_shows_what_was_measured(measure: str, run: Run, lines: list[str]) -> None:
+def test_a_page_shows_the_measured_values(measure: str, run: Run, lines: list[str]) -> None:
     page = report.page(measure, run)
     for line in lines:
         assert line in page

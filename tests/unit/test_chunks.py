@@ -91,7 +91,7 @@ def test_without_a_measurement_the_size_stays() -> None:
     assert known.seconds == pytest.approx(1e-3)
 
 
-def test_stride_is_one_unless_tasks_are_very_short() -> None:
+def test_the_stride_is_one_unless_tasks_are_very_short() -> None:
     assert TaskPace().stride() == 1
     assert pace(1e-3).stride() == 1
     assert 1 < pace(2e-6).stride() <= STRIDE_LIMIT

@@ -347,7 +347,7 @@ def test_transient_errors_are_tried_again(server: Served, api: Api, fault: Fault
     assert server.api.count("list", "pods") == 3
 
 
-def test_with_timeout_0_there_is_one_attempt(server: Served, api: Api) -> None:
+def test_a_call_with_timeout_0_makes_one_attempt(server: Served, api: Api) -> None:
     server.api.faults.append(Fault(status=503, times=9))
     with pytest.raises(ServerError):
         api.list(ALL, timeout=0.0)

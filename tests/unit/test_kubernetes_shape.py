@@ -71,7 +71,7 @@ def test_a_pool_is_called_after_the_program_and_its_wishes(resources: Resources,
 
 @pytest.mark.parametrize("program", ["x" * 80, "a-" * 40, "Übung", "_", "9", "es"])
 @pytest.mark.parametrize("resources", [Resources(), Resources(cpu=0.0001, memory=10**9, gpu=1000)])
-def test_every_name_is_one_that_a_pool_may_have(program: str, resources: Resources) -> None:
+def test_each_name_of_a_shape_is_valid_for_a_pool(program: str, resources: Resources) -> None:
     name = pool_name(program, PodShape().with_resources(resources), "1a2b3c")
     assert names.check_pool_name(name) == name
     assert name.endswith("-1a2b3c")

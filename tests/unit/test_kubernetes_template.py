@@ -356,7 +356,7 @@ class TestOwnContainer:
         assert own_container(pod, self.MOUNTINFO.replace("main", "gone")) == "proxy"
 
 
-def test_a_fiber_pool_is_one_that_the_operator_can_read() -> None:
+def test_the_operator_can_read_a_fiber_pool_of_the_sdk() -> None:
     config = Config(max_pods=50, processes_per_pod=8, idle_timeout=1.5)
     body = fiber_pool_body("es-1a2b3c", pod_template(PodShape(), None, ""), config)
     pool = FiberPool.read(body)

@@ -113,7 +113,7 @@ def test_the_next_master_has_a_higher_epoch_and_the_same_lease(rig: Rig, told: T
     assert taken["spec"]["acquireTime"] == taken["spec"]["renewTime"]
 
 
-def test_the_epoch_is_told_before_an_agent_can_dial(
+def test_the_epoch_is_reported_before_an_agent_can_dial(
     rig: Rig, told: Told, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen: list[tuple[int, bool]] = []

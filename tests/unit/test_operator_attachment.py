@@ -105,7 +105,7 @@ def test_a_plan_has_this_work(pool: FiberPool, pods: list[Json], known: Json, wo
     assert work_of(plan_of(pool, *pods, **known)) == work
 
 
-def test_as_many_are_released_as_are_more_than_the_minimum() -> None:
+def test_only_workers_above_the_minimum_are_released() -> None:
     made = plan_of(releasing(1, 2, replicas=1, minReplicas=3), *THREE, running(4))
     assert (len(made.delete), made.create) == (1, 0)
     assert made.delete[0].name in names(1, 2)

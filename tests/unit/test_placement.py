@@ -171,7 +171,7 @@ def test_never_more_than_the_maximum() -> None:
     assert demand(placement, maximum=3).decide(now=0).agents == 3
 
 
-def test_an_idle_agent_is_released_by_name_after_its_time_and_gets_no_child_any_more() -> None:
+def test_an_idle_agent_is_released_by_name_after_the_timeout_and_gets_no_child() -> None:
     placement = with_agents("a", "b", slots=1)  # idle since 0 and 1
     wanted = demand(placement)
     wish = wanted.decide(now=2)

@@ -352,7 +352,9 @@ def test_a_file_that_grows_beyond_the_limit_during_packing_is_the_same_error(
         shipping.pack(layout(folder), found)
 
 
-def test_too_many_files_are_not_even_counted(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_program_with_too_many_files_is_refused(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(program_files, "MOST_FILES", 3)
     with pytest.raises(ProgramTooLarge, match="more than 3 files"):
         files(folder)
