@@ -307,22 +307,12 @@ class ClientHandler:
 
     def recv(self, message: Message) -> None:
         """Receive a message."""
-        self._channel().receive(self._request(message), wait=True)
-
-    def try_recv(self, message: Message) -> None:
-        """Receive a message if one is there."""
-        self._channel().receive(self._request(message), wait=False)
+        self._channel().receive(self._request(message))
 
     def draw(self, message: Message) -> None:
         """Receive a message and raise a counter."""
-        self._channel().receive(self._counting(message), wait=True)
-
-    def try_draw(self, message: Message) -> None:
-        """Receive a message and raise a counter, if a message is there."""
-        self._channel().receive(self._counting(message), wait=False)
-
-    def _counting(self, message: Message) -> PendingRequest:
-        return self._request(message, partial(self._counter_named_in(message).add, 1))
+        granted = partial(self._counter_named_in(message).add, 1)
+        self._channel().receive(self._request(message, granted))
 
     def poll(self, message: Message) -> None:
         """Wait for a message."""
@@ -397,10 +387,6 @@ class ClientHandler:
     def value(self, message: Message) -> None:
         """Reply with the count."""
         self._request(message).answer(Status.OK, self._counter().value())
-
-    def wait(self, message: Message) -> None:
-        """Wait until the count is above zero."""
-        self._counter().wait(self._request(message))
 
     def changed(self, message: Message) -> None:
         """Wait until the count changes."""
@@ -488,12 +474,6 @@ class ClientHandler:
     def hold(self, message: Message) -> None:
         """Note how many things the process of this stream has."""
         self._wait_list().places.hold(self._own_place(), ONE.unpack(message.payload)[2])
-
-    def tally(self, message: Message) -> None:
-        """Note how many things the process of this stream has, and set the second word."""
-        _, _, held, total = TWO.unpack(message.payload)
-        self._wait_list().places.tally(self._own_place(), held, total)
-        self._request(message).answer(Status.OK)
 
     def held(self, message: Message) -> None:
         """Reply with the number of things that the processes of all places have."""

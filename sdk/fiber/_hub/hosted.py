@@ -57,13 +57,10 @@ class HostedChannel:
         self._serve_senders()
         self._watch()
 
-    def receive(self, waiter: Waiter, *, wait: bool) -> None:
+    def receive(self, waiter: Waiter) -> None:
         """Reply with the next message."""
         self._receivers.append(waiter)
         self._serve_receivers()
-        if not wait and waiter in self._receivers:
-            self._receivers.remove(waiter)
-            waiter.answer(Status.NO)
         self._watch()
 
     def poll(self, waiter: Waiter) -> None:
@@ -206,7 +203,6 @@ class HostedCounter:
         self._poller = poller
         self._counter = counter
         self._takers: deque[Waiter] = deque()
-        self._waiters: deque[Waiter] = deque()
         self._changes: dict[Waiter, int] = {}
 
     def fileno(self) -> int:
@@ -230,11 +226,6 @@ class HostedCounter:
         self._takers.append(waiter)
         self._event(IN)
 
-    def wait(self, waiter: Waiter) -> None:
-        """Reply once the count is above zero."""
-        self._waiters.append(waiter)
-        self._event(IN)
-
     def changed(self, waiter: Waiter, since: int) -> None:
         """Reply once the count is not ``since``."""
         self._changes[waiter] = since
@@ -243,10 +234,9 @@ class HostedCounter:
     def withdraw(self, waiter: Waiter) -> bool:
         """Stop waiting; return False if ``waiter`` did not wait."""
         found = self._changes.pop(waiter, None) is not None
-        for queue in (self._takers, self._waiters):
-            if waiter in queue:
-                queue.remove(waiter)
-                found = True
+        if waiter in self._takers:
+            self._takers.remove(waiter)
+            found = True
         self._watch()
         return found
 
@@ -256,16 +246,13 @@ class HostedCounter:
         self._counter.close()
 
     def _watch(self) -> None:
-        mask = IN if self._takers or self._waiters else 0
+        mask = IN if self._takers else 0
         if not mask and self._changes:
             # Without EDGE, a count that stays above zero would be reported again and again.
             mask = IN | EDGE
         self._poller.watch(self._counter.fileno(), mask, self._event)
 
     def _event(self, _events: int) -> None:
-        if self._waiters and self._counter.wait(0):
-            while self._waiters:
-                self._waiters.popleft().answer(Status.OK)
         if self._changes:
             value = self._counter.value()
             for waiter in [waiter for waiter, since in self._changes.items() if since != value]:

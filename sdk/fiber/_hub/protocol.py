@@ -21,7 +21,7 @@ from collections.abc import Callable
 from enum import IntEnum, IntFlag
 from typing import NamedTuple
 
-VERSION = 3
+VERSION = 4
 KEY_BYTES = 32
 
 SECRET_BYTES = 16
@@ -94,18 +94,15 @@ class Op(IntEnum):
     # For an attached channel
     SEND = 10  # payload and buffers beside it
     RECV = 11  # -> more; payload and buffers beside it
-    TRY_RECV = 12  # -> the same, or NO
     POLL = 13
     WATCH = 14  # silent; the stream gets READY once the channel is readable
     CHECK = 15  # NO if it is not readable now; then as WATCH
     DRAW = 16  # token of a counter -> as RECV; raises that counter by one
-    TRY_DRAW = 17  # the same -> as TRY_RECV
     # For an attached counter
     ADD = 20  # how much
     TAKE = 21
     CLEAR = 22  # -> count
     VALUE = 23  # -> count
-    WAIT = 24
     CHANGED = 25  # since
     CLAIM = 26  # as TAKE; undone at the end of the stream or at the next request, except
     KEEP = 27  # which keeps it; silent
@@ -124,7 +121,6 @@ class Op(IntEnum):
     SET = 57  # which, the word
     HOLD = 58  # number of things of the stream's process; silent
     RECLAIM = 59  # token of a counter, which is raised by -> number of things of dead processes
-    TALLY = 60  # number of things of the stream's process; the second word
     HELD = 61  # -> number of things of all processes
 
 

@@ -211,17 +211,25 @@ class RemoteChannel(RemoteObject):
 
     def try_recv(self) -> Message | None:
         """Return the next message if there is one; ConnectionClosed at the end."""
-        return self._receive(Op.TRY_RECV)
+        return self._receive(Op.RECV, timeout=0)
 
     def recv_counting(self, counter: RemoteCounter, *, wait: bool) -> Message | None:
         """Receive a message, and have the hub raise ``counter``; None if there is no message."""
-        return self._receive(Op.DRAW if wait else Op.TRY_DRAW, counter.known(), form=SECRET)
+        timeout = None if wait else 0
+        return self._receive(Op.DRAW, counter.known(), form=SECRET, timeout=timeout)
 
-    def _receive(self, operation: Op, *values: bytes, form: struct.Struct = HEAD) -> Message | None:
+    def _receive(
+        self,
+        operation: Op,
+        *values: bytes,
+        form: struct.Struct = HEAD,
+        timeout: float | None = None,
+    ) -> Message | None:
         with self.stream() as stream:
-            reply = (
-                self._late.popleft() if self._late else stream.ask(operation, *values, form=form)
-            )
+            if self._late:
+                reply = self._late.popleft()
+            else:
+                reply = stream.ask(operation, *values, form=form, timeout=timeout)
         if reply.status is Status.EOF:
             raise ConnectionClosed()
         if reply.status is Status.NO:
@@ -325,8 +333,7 @@ class RemoteCounter(RemoteObject):
 
     def wait(self, timeout: float | None) -> bool:
         """Wait until the count is above zero, without lowering it."""
-        with self.stream() as stream:
-            return stream.ask(Op.WAIT, timeout=timeout).status is Status.OK
+        return self.changed(0, timeout)
 
     def changed(self, since: int, timeout: float | None) -> bool:
         """Wait until the count is not ``since``; False when ``timeout`` is over."""

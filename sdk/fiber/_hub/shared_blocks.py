@@ -292,7 +292,8 @@ class RemoteWaitList(RemoteObject):
 
     def tally(self, place: HubStream, held: int, total: int) -> None:
         """Note how many things the process at ``place`` has, and set the user's second word."""
-        place.ask(Op.TALLY, held, total, form=TWO)
+        self.hold(place, held)
+        place.ask(Op.SET, 1, total, form=TWO)
 
     def held(self) -> int:
         """Return the number of things that the processes of all places have."""
