@@ -44,7 +44,7 @@ def break_in(mine: Any) -> tuple[int, list[bytes]]:
             stream = HubStream(home)
             try:
                 stream._send(form.pack(*say))
-                found += map(bytes, stream.ask(Op.TRY_RECV).parts)
+                found += map(bytes, stream.ask(Op.RECV, timeout=0).parts)
             except ObjectUnreachable:
                 refused += 1
             finally:
