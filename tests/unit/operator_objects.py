@@ -49,7 +49,7 @@ def proven(pool: FiberPool, **status: Any) -> Json:
     return {"provenTemplateHash": template_hash(pool), "failures": failures, **status}
 
 
-def tried(status: Mapping[str, Any] | None = None, **spec: Any) -> FiberPool:
+def tried(status: Mapping[str, Any] | None = None, /, **spec: Any) -> FiberPool:
     """Return a pool whose template is known to work."""
     return make_pool(proven(make_pool(**spec), **(status or {})), **spec)
 

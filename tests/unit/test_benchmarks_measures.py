@@ -193,7 +193,7 @@ def test_a_fake_agent_runs_the_tasks_of_its_child_and_ends_it() -> None:
         exited=lambda report: heard.append((report.exitcode, report.host)),
     )
     agent = FakeAgent(loop, "host-1", TaskRunner())  # type: ignore[arg-type]  # all that it uses
-    child = agent.child(ChildSpec("w", "fork", b"", b"", tasks=True), observer)  # type: ignore[arg-type]
+    child = agent.child(ChildSpec("w", "fork", b"", b"", tasks=True), observer)
     child.start()
     child.deliver(7, work.pack_calls([(pickle.dumps((no_op, (42,), {})), ())]))
     child.recall()

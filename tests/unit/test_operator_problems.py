@@ -151,6 +151,12 @@ DO_NOT_START = [
     row("no-longer-ready", "NotReady Warning; node silent", unready("node silent")),
 ]
 
+GONE: list[tuple[str, Json]] = [
+    ("", {}),
+    (" (Error)", {"lastReason": "Error"}),
+    (" (OOMKilled, exit code 137)", {"lastReason": "OOMKilled", "lastExitCode": 137}),
+]
+
 FAIL = [
     row(
         "exit-code",
@@ -217,13 +223,7 @@ FAIL = [
             "of the pool with kubectl describe fiberpool es. (end)",
             pool=counted(waves=2, **failures),
         )
-        for number, (known, failures) in enumerate(
-            [
-                ("", {}),
-                (" (Error)", {"lastReason": "Error"}),
-                (" (OOMKilled, exit code 137)", {"lastReason": "OOMKilled", "lastExitCode": 137}),
-            ]
-        )
+        for number, (known, failures) in enumerate(GONE)
     ),
 ]
 
@@ -355,10 +355,10 @@ def test_failures_are_summed_up_while_they_last() -> None:
         assert status_of(first, *pods, now=NOW + 3).problems == first.status.problems
     (more,) = status_of(first, ended(1), ended(2), ended(3, ago=-2), now=NOW + 5).problems
     assert (more.count, more.pod) == (3, name_of(3))
-    pods = ended(1, ago=5), ended(2, code=0, ran=100)
-    mixed = after(POOL, *pods)
+    both = ended(1, ago=5), ended(2, code=0, ran=100)
+    mixed = after(POOL, *both)
     assert mixed.status.failures.last_reason == "Error"
-    assert status_of(mixed, *pods) == mixed.status
+    assert status_of(mixed, *both) == mixed.status
 
 
 def test_a_problem_keeps_its_time_and_none_is_in_the_future() -> None:

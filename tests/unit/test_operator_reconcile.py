@@ -263,7 +263,7 @@ def test_a_refused_template_replaces_no_pod(strategy: str) -> None:
     old = outdated(running(1), pod_document(2))
     assert plan_of(pool, *old, accepted=None).delete == ()
     refused = PodRefusal(template_hash(pool), 422, "spec.containers[0].image: Required value", NOW)
-    known = {"accepted": None, "refusal": refused}
+    known: Json = {"accepted": None, "refusal": refused}
     assert work_of(plan_of(pool, *old, **known)) == "+0"
     assert work_of(plan_of(pool, *old, **known, now=NOW + 9)) == "+0 trial"
 
