@@ -15,7 +15,7 @@ from fiber_api.times import format_time
 from fiber_api.v1alpha1 import FiberPool
 from fiber_operator.metrics import PoolSample
 from fiber_operator.planning import plans
-from fiber_operator.planning.pods import PodState, observe
+from fiber_operator.planning.pods import observe
 from fiber_operator.planning.podspec import pod
 from patience import PATIENCE
 from unit.operator_objects import (
@@ -113,37 +113,32 @@ def test_the_probe_ends_when_the_file_is_there(tmp_path: Path) -> None:
 # -- Plan and status
 
 
-def test_a_pod_that_is_not_linked_counts_as_one_that_runs() -> None:
-    found = observe(joining(age=50), "worker")
-    assert (found.state, found.joining, found.was_ready) == (PodState.READY, True, True)
-    assert found.since == NOW - 49
-    assert not found.trouble
+def beside(document: Json, name: str) -> Json:
+    """Return the pod with another container that is not ready."""
+    other = {"name": name, "ready": False, "state": {"running": {}}}
+    document["status"]["containerStatuses"].append(other)
+    return document
+
+
+FALSE = {"exec": {"command": ["false"]}}
 
 
 @pytest.mark.parametrize(
-    "document",
+    ("document", "state", "waits"),
     [
-        joining(readinessProbe={"exec": {"command": ["false"]}}),
-        joining(startupProbe={"exec": {"command": ["false"]}}),
-        running(ready=False),
+        pytest.param(joining(age=50), "Ready", True, id="not-linked"),
+        pytest.param(joining(readinessProbe=FALSE), "Starting", False, id="own-readiness"),
+        pytest.param(joining(startupProbe=FALSE), "Starting", False, id="own-startup"),
+        pytest.param(running(ready=False), "Starting", False, id="no-probe"),
+        pytest.param(beside(joining(), "proxy"), "Starting", False, id="another-container"),
+        pytest.param(terminating(joining()), "Terminating", False, id="deleted"),
     ],
-    ids=["own-readiness", "own-startup", "no-probe"],
 )
-def test_other_reasons_keep_a_pod_from_ready(document: Json) -> None:
+def test_a_pod_that_is_not_linked_counts_as_ready(document: Json, state: str, waits: bool) -> None:
     found = observe(document, "worker")
-    assert (found.state, found.joining) == (PodState.STARTING, False)
-
-
-def test_another_container_that_is_not_ready_does() -> None:
-    document = joining()
-    other = {"name": "proxy", "ready": False, "state": {"running": {}}}
-    document["status"]["containerStatuses"].append(other)
-    assert observe(document, "worker").state is PodState.STARTING
-
-
-def test_a_deleted_pod_is_not_joining() -> None:
-    found = observe(terminating(joining()), "worker")
-    assert (found.state, found.joining) == (PodState.TERMINATING, False)
+    assert (found.state, found.joining) == (state, waits)
+    if waits:
+        assert (found.was_ready, found.since, found.trouble) == (True, NOW - 49, None)
 
 
 def test_a_pool_is_ready_when_its_workers_are_linked() -> None:
@@ -181,38 +176,33 @@ def test_the_metrics_distinguish_connected_from_ready_pods() -> None:
 # -- How many are connected
 
 
-def connected(pool: FiberPool, **lease: Any) -> int | None:
-    verdict = plans.LeaseVerdict(**lease)
-    return status_of(pool, *map(running, range(3)), master=verdict).connected_replicas
+WAITING = make_pool(replicas=3, master=LEASED)
 
 
-def test_the_lease_of_a_live_master_says_how_many_agents_it_has() -> None:
-    pool = make_pool(replicas=3, master=LEASED)
-    assert connected(pool, alive=True, connected=2) == 2
-    assert connected(pool, alive=True, connected=9) == 3
-    assert connected(pool, alive=True) is None
+def known_before(epoch: int) -> FiberPool:
+    """Return a pool whose status says that the first master had two agents."""
+    alive = {"type": "MasterAlive", "status": "True", "lastTransitionTime": format_time(NOW - 9)}
+    before = {"connectedReplicas": 2, "masterEpoch": 1, "conditions": [alive]}
+    return make_pool(before, replicas=3, master={**LEASED, "epoch": epoch})
 
 
-def test_a_pool_without_a_living_master_has_no_connected_agents() -> None:
-    lost = make_pool(replicas=3, master=LEASED)
-    assert connected(lost, alive=False, connected=2) == 0
-    assert connected(make_pool(minReplicas=3)) == 0
-
-
-def test_without_a_lease_the_number_of_connected_agents_is_unknown() -> None:
-    assert connected(make_pool(replicas=3, master=MASTER)) is None
-
-
-@pytest.mark.parametrize(("epoch", "known"), [(1, 2), (2, None)])
-def test_an_operator_that_starts_goes_by_the_status_of_this_very_master(
-    epoch: int, known: int | None
+@pytest.mark.parametrize(
+    ("pool", "alive", "told", "connected"),
+    [
+        pytest.param(WAITING, True, 2, 2, id="lease"),
+        pytest.param(WAITING, True, 9, 3, id="more-than-pods"),
+        pytest.param(WAITING, True, None, None, id="lease-without-number"),
+        pytest.param(WAITING, False, 2, 0, id="lost-master"),
+        pytest.param(make_pool(minReplicas=3), None, None, 0, id="no-master"),
+        pytest.param(make_pool(replicas=3, master=MASTER), None, None, None, id="no-lease"),
+        # An operator that starts goes by the status of this very master.
+        pytest.param(known_before(epoch=1), None, None, 2, id="status"),
+        pytest.param(known_before(epoch=2), None, None, None, id="status-of-another-master"),
+    ],
+)
+def test_the_lease_of_a_live_master_has_the_number_of_its_agents(
+    pool: FiberPool, alive: bool | None, told: int | None, connected: int | None
 ) -> None:
-    before = {
-        "connectedReplicas": 2,
-        "masterEpoch": 1,
-        "conditions": [
-            {"type": "MasterAlive", "status": "True", "lastTransitionTime": format_time(NOW - 9)}
-        ],
-    }
-    pool = make_pool(before, replicas=3, master={**LEASED, "epoch": epoch})
-    assert connected(pool) == known
+    verdict = plans.LeaseVerdict(alive, connected=told)
+    status = status_of(pool, *map(running, range(3)), master=verdict)
+    assert status.connected_replicas == connected
