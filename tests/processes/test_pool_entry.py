@@ -480,6 +480,22 @@ def test_a_runtime_whose_making_was_interrupted_leaves_no_thread(
     pool.join()
 
 
+def test_a_runtime_made_within_making_one_keeps_its_hub() -> None:
+    done = run_program("""
+        import fiber
+        from fiber._runtime import state
+        real = state._make_backend
+        def interrupted(runtime):
+            state._make_backend = real
+            state.runtime()
+            return real(runtime)
+        state._make_backend = interrupted
+        with fiber.Pool(1) as pool:
+            print(pool.apply(type, (fiber.Queue(),)).__name__)
+    """)
+    assert (done.stdout, done.stderr) == ("Queue\n", "")
+
+
 # Forks
 
 

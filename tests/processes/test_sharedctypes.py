@@ -17,7 +17,9 @@ import pytest
 
 import fiber
 from fiber import sharedctypes
+from fiber._hub.heap import LARGE, allocate
 from patience import PATIENCE
+from unit.test_heap import SharedBytes
 
 
 class Point(ctypes.Structure):
@@ -208,3 +210,18 @@ def test_part_of_a_shared_array_pickles_by_value() -> None:
     part = pickle.loads(pickle.dumps(points[1]))
     part.x = 9
     assert points[1].x == 3
+
+
+def _write_each(*shared: SharedBytes) -> None:
+    for number, each in enumerate(shared):
+        each.block.view[0] = (number + 1) % 256
+
+
+def test_a_process_of_this_host_has_the_memory_itself() -> None:
+    small = [SharedBytes(allocate(8)) for _ in range(300)]  # more than descriptors in a message
+    large = SharedBytes(allocate(LARGE))
+    process = fiber.Process(target=_write_each, args=(large, *small))
+    process.start()
+    process.join()
+    assert large.block.view[0] == 1
+    assert [each.block.view[0] for each in small] == [n % 256 for n in range(2, 302)]

@@ -1,10 +1,11 @@
-"""Event, Semaphore, BoundedSemaphore."""
+"""Locks, semaphores, events and barriers among processes."""
 
 from __future__ import annotations
 
 import math
 import multiprocessing
 import os
+import pickle
 import signal
 import threading
 from collections.abc import Callable
@@ -112,3 +113,45 @@ def test_a_waiter_is_woken_even_if_the_event_is_cleared_at_once() -> None:
             event.set()
             event.clear()
     assert woken == [True] * 100
+
+
+def add(lock: Any, count: Any, times: int) -> None:
+    for _ in range(times):
+        with lock:
+            count.put(count.get() + 1)
+
+
+def test_a_waiter_gets_the_lock() -> None:
+    lock, count = fiber.Lock(), fiber.SimpleQueue()
+    count.put(0)
+    processes = [fiber.Process(target=add, args=(lock, count, 100)) for _ in range(3)]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join(PATIENCE)
+    assert count.get() == 300
+
+
+def test_pickled_anywhere_it_is_the_same() -> None:
+    lock, queue = fiber.RLock(), fiber.Queue()
+    queue.put(lock)
+    with lock, queue.get(timeout=PATIENCE) as again:
+        assert again
+    with fiber.Pool(1) as pool:
+        assert pool.apply(repr, (lock,)) == "<RLock(None, 0)>"
+
+
+def take_part(barrier: Any) -> None:
+    barrier.wait(PATIENCE)
+
+
+def test_members_that_end_in_good_order_are_not_missed() -> None:
+    barrier = fiber.Barrier(2)
+    for _ in range(2):
+        process = fiber.Process(target=take_part, args=(barrier,))
+        process.start()
+        barrier.wait(PATIENCE)
+        process.join(PATIENCE)
+    with barrier._cond:
+        assert not barrier._bury()
+    assert pickle.loads(pickle.dumps(barrier)).parties == 2

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import pickle
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -323,22 +322,6 @@ def test_a_member_that_dies_elsewhere_breaks_the_barrier(hosts: Hosts) -> None:
     there._members.enter().close()
     with pytest.raises(threading.BrokenBarrierError, match="a process that took part has died"):
         barrier.wait(PATIENCE)
-
-
-def take_part(barrier: Any) -> None:
-    barrier.wait(PATIENCE)
-
-
-def test_members_that_end_in_good_order_are_not_missed() -> None:
-    barrier = fiber.Barrier(2)
-    for _ in range(2):
-        process = fiber.Process(target=take_part, args=(barrier,))
-        process.start()
-        barrier.wait(PATIENCE)
-        process.join(PATIENCE)
-    with barrier._cond:
-        assert not barrier._bury()
-    assert pickle.loads(pickle.dumps(barrier)).parties == 2
 
 
 @pytest.mark.usefixtures("quick")

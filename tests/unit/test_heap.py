@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 
-import fiber
 from fiber._hub import handles, heap
 from fiber._hub.handles import BlockHandle
 from fiber._hub.heap import ALIGNMENT, LARGE, SEGMENT, Block, allocate
@@ -32,11 +31,6 @@ class SharedBytes:
 
 def _rebuild(handle: BlockHandle) -> Any:
     return handle.remote_handle() or SharedBytes(handle.block())
-
-
-def _write_each(*shared: SharedBytes) -> None:
-    for number, each in enumerate(shared):
-        each.block.view[0] = (number + 1) % 256
 
 
 @pytest.mark.parametrize("size", [0, 1, 63, 64, 65, LARGE - 1, LARGE, SEGMENT + 1])
@@ -117,16 +111,6 @@ def test_ctrl_c_at_any_step_leaves_no_descriptor() -> None:
         steps += 1
     assert steps > 10, "it was hardly interrupted"
     assert len(os.listdir("/proc/self/fd")) == before
-
-
-def test_a_process_of_this_host_has_the_memory_itself() -> None:
-    small = [SharedBytes(allocate(8)) for _ in range(300)]  # more than descriptors in a message
-    large = SharedBytes(allocate(LARGE))
-    process = fiber.Process(target=_write_each, args=(large, *small))
-    process.start()
-    process.join()
-    assert large.block.view[0] == 1
-    assert [each.block.view[0] for each in small] == [n % 256 for n in range(2, 302)]
 
 
 def test_a_hub_hands_the_memory_to_processes_of_its_host_and_not_to_others() -> None:

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import os
 import pickle
-import signal
 import socket
 import stat
 import threading
-from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -25,12 +23,6 @@ from fiber._wire import packet
 from fiber.connection import Connection
 from hosts import Hosts, objects_kept
 from patience import PATIENCE
-
-
-def start(target: Callable[..., Any], *args: Any) -> fiber.Process:
-    process = fiber.Process(target=target, args=args, daemon=True)
-    process.start()
-    return process
 
 
 def inode(connection: Connection) -> int:
@@ -315,92 +307,6 @@ def test_a_hub_without_descriptors_lets_callers_wait(
 
 
 # Children
-
-
-def in_a_child(own: HubAddress, commands: Connection) -> None:
-    """Lends and borrows as told, in a process that reaches the hub by its socket."""
-    client.set_hub_address(own)
-    for command in iter(commands.recv, None):
-        if command == "lend":
-            here, there = fiber.Pipe()
-            commands.send_bytes(pickle.dumps(there))
-            there.close()
-            here.send("from the child")
-        elif command == "die":
-            os.kill(os.getpid(), signal.SIGKILL)
-        else:
-            borrowed = pickle.loads(command)
-            borrowed.send(borrowed.recv() * 2)
-            borrowed.close()
-
-
-@pytest.fixture
-def child(hosts: Hosts) -> Iterator[Connection]:
-    ours, theirs = fiber.Pipe()
-    process = start(in_a_child, hosts["a"].address, theirs)
-    theirs.close()
-    yield ours
-    ours.close()
-    process.kill()
-    process.join()
-
-
-def test_a_child_borrows(hosts: Hosts, child: Connection) -> None:
-    with hosts.at("a") as hub:
-        here, there = fiber.Pipe()
-        child.send(pickle.dumps(there))
-        there.close()
-        here.send("ab")
-        assert here.recv() == "abab"
-        with pytest.raises(EOFError):
-            here.recv()
-        assert objects_kept(hub) == 0
-
-
-def test_objects_that_a_child_shares_outlive_it(hosts: Hosts, child: Connection) -> None:
-    with hosts.at("a"):
-        child.send("lend")
-        data = child.recv_bytes()
-        child.send("die")
-        with pytest.raises(EOFError):
-            child.recv()
-        borrowed = pickle.loads(data)
-        assert borrowed.recv() == "from the child"
-        with pytest.raises(EOFError):
-            borrowed.recv()
-
-
-def test_children_of_a_host_share_objects_without_the_hub(hosts: Hosts, child: Connection) -> None:
-    with hosts.child_at("a"):
-        child.send("lend")
-        borrowed = pickle.loads(child.recv_bytes())
-        assert borrowed.recv() == "from the child"
-
-
-def collect_and_die(own: HubAddress, results: Connection) -> None:
-    client.set_hub_address(own)
-    _, there = fiber.Pipe()
-    with collecting_grants() as collected:
-        results.send_bytes(pickle.dumps(there))
-    results.recv()
-    assert collected
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-def test_collected_grants_of_a_dead_process_are_released(hosts: Hosts) -> None:
-    hub = hosts["a"]
-    ours, theirs = fiber.Pipe()
-    process = start(collect_and_die, hub.address, theirs)
-    theirs.close()
-    data = ours.recv_bytes()
-    with hosts.at("a"):
-        pickle.loads(data)
-        pickle.loads(data)
-        assert objects_kept(hub) == 1
-        ours.send("die")
-        process.join(PATIENCE)
-        assert wait_until(lambda: objects_kept(hub) == 0, PATIENCE)
-    ours.close()
 
 
 def test_a_child_takes_back_its_collected_grants(hosts: Hosts) -> None:

@@ -6,7 +6,6 @@ Host ``a`` has the objects; this process is on host ``b``.
 from __future__ import annotations
 
 import multiprocessing
-import os
 import pickle
 import signal
 import threading
@@ -20,94 +19,11 @@ from census import wait_until
 from fiber._hub import client
 from fiber._hub.client import ObjectUnreachable
 from fiber._hub.local import LocalCounter
-from fiber._hub.protocol import HubAddress
 from fiber.connection import Connection
 from hosts import Far, Hosts, Wire, background, objects_kept
 from patience import PATIENCE
 
 # Processes that die, links that break
-
-
-def receive_from_afar(own: HubAddress, data: bytes, report: Connection, times: int) -> None:
-    client.set_hub_address(own)
-    remote = pickle.loads(data)
-    remote.poll(0)
-    report.send("ready")
-    for _ in range(times):
-        report.send(remote.recv())
-    report.recv()
-
-
-@pytest.fixture
-def lost_soul(hosts: Hosts, far: Far) -> Iterator[Callable[..., Any]]:
-    """Starts a child on host b that receives from afar."""
-    started: list[tuple[fiber.Process, Connection]] = []
-
-    def begin(end: Connection, times: int = 1) -> tuple[fiber.Process, Connection]:
-        with hosts.at("a"):
-            data = pickle.dumps(end)
-        ours, theirs = fiber.Pipe()
-        arguments = (hosts["b"].address, data, theirs, times)
-        process = fiber.Process(target=receive_from_afar, args=arguments, daemon=True)
-        process.start()
-        theirs.close()
-        started.append((process, ours))
-        assert ours.recv() == "ready"
-        return process, ours
-
-    yield begin
-    for process, ours in started:
-        ours.close()
-        process.kill()
-        process.join()
-        process.close()
-
-
-def use_queue_from_afar(own: HubAddress, data: bytes, put: bool, report: Connection) -> None:
-    client.set_hub_address(own)
-    queue = pickle.loads(data)
-    report.send("ready")
-    queue.put("lost") if put else queue.get()
-
-
-@pytest.mark.parametrize("put", [True, False])
-def test_a_receiver_that_dies_before_its_answer_takes_no_place(
-    put: bool, hosts: Hosts, far: Far, wires: tuple[Wire, Wire]
-) -> None:
-    queue: Any = fiber.Queue(1)
-    free = queue._slots._free
-    if put:
-        queue.put("first")
-    with hosts.at("a"):
-        data = pickle.dumps(queue)
-    ours, theirs = fiber.Pipe()
-    arguments = (hosts["b"].address, data, put, theirs)
-    process = fiber.Process(target=use_queue_from_afar, args=arguments, daemon=True)
-    process.start()
-    assert ours.recv() == "ready"
-
-    def asks() -> bool:
-        kept = hosts["a"].registry._users.values()
-        served = [users[0].hosted for users in list(kept)]
-        return any(getattr(each, "_takers" if put else "_receivers", ()) for each in served)
-
-    assert wait_until(asks, PATIENCE)
-    _, down = wires
-    done = threading.Event()
-    hosts.on_loop(lambda: (down.hold(), done.set()))
-    assert done.wait(PATIENCE)
-    if put:
-        assert queue.get() == "first"
-    else:
-        queue.put("lost")
-    assert wait_until(lambda: bool(down.held), PATIENCE)  # the answer is on its way
-    process.kill()
-    process.join(PATIENCE)
-    hosts.on_loop(down.let_go)
-    assert wait_until(lambda: free.value() == 1, PATIENCE)
-    assert queue.empty()
-    ours.close()
-    theirs.close()
 
 
 def test_an_interrupted_take_gives_back_only_its_tokens(
@@ -123,42 +39,6 @@ def test_an_interrupted_take_gives_back_only_its_tokens(
             remote.take(None)
     assert remote.value() == 0
     remote.close()
-
-
-def test_a_remote_receiver_killed_while_waiting_takes_no_message(
-    hosts: Hosts, lost_soul: Callable[..., Any]
-) -> None:
-    here, there = fiber.Pipe()
-    process, _ = lost_soul(there)
-    os.kill(process.pid, signal.SIGKILL)
-    process.join(PATIENCE)
-    assert wait_until(lambda: objects_kept(hosts["a"]) == 0, PATIENCE)
-    here.send("still here")
-    assert there.recv() == "still here"
-
-
-def test_a_far_receiver_takes_no_more_than_it_asked_for(
-    lost_soul: Callable[..., Any],
-) -> None:
-    here, there = fiber.Pipe()
-    process, report = lost_soul(there, 2)
-    for number in range(5):
-        here.send(number)
-    assert [report.recv(), report.recv()] == [0, 1]
-    os.kill(process.pid, signal.SIGKILL)
-    process.join(PATIENCE)
-    assert [there.recv() for _ in range(3)] == [2, 3, 4]
-
-
-def test_the_end_comes_when_the_last_far_holder_is_killed(lost_soul: Callable[..., Any]) -> None:
-    here, there = fiber.Pipe()
-    process, _ = lost_soul(there)
-    there.close()
-    assert not here.poll(0)
-    os.kill(process.pid, signal.SIGKILL)
-    with pytest.raises(EOFError):
-        here.recv()
-    process.join(PATIENCE)
 
 
 def test_a_lost_link_ends_every_wait_with_its_reason(hosts: Hosts, far: Far) -> None:

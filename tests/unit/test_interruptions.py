@@ -38,7 +38,6 @@ from fiber.connection import Connection, wait
 from fiber.results import IMapIterator
 from hosts import Hosts, objects_kept
 from patience import PATIENCE
-from processes.pool_programs import run_program
 from unit.interrupting import CALLS, INSTRUCTIONS, is_interrupted
 
 MORE_THAN_FITS = 2000
@@ -154,22 +153,6 @@ def test_ctrl_c_in_acquire_leaves_the_lock_to_others(make: Callable[[], Any]) ->
 
 
 # The runtime
-
-
-def test_a_runtime_made_within_making_one_keeps_its_hub() -> None:
-    done = run_program("""
-        import fiber
-        from fiber._runtime import state
-        real = state._make_backend
-        def interrupted(runtime):
-            state._make_backend = real
-            state.runtime()
-            return real(runtime)
-        state._make_backend = interrupted
-        with fiber.Pool(1) as pool:
-            print(pool.apply(type, (fiber.Queue(),)).__name__)
-    """)
-    assert (done.stdout, done.stderr) == ("Queue\n", "")
 
 
 # Handles

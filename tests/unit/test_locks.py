@@ -122,32 +122,6 @@ def test_an_rlock_is_its_threads() -> None:
     assert elsewhere(lambda: lock.acquire(False))
 
 
-def add(lock: Any, count: Any, times: int) -> None:
-    for _ in range(times):
-        with lock:
-            count.put(count.get() + 1)
-
-
-def test_a_waiter_gets_the_lock() -> None:
-    lock, count = fiber.Lock(), fiber.SimpleQueue()
-    count.put(0)
-    processes = [fiber.Process(target=add, args=(lock, count, 100)) for _ in range(3)]
-    for process in processes:
-        process.start()
-    for process in processes:
-        process.join(PATIENCE)
-    assert count.get() == 300
-
-
-def test_pickled_anywhere_it_is_the_same() -> None:
-    lock, queue = fiber.RLock(), fiber.Queue()
-    queue.put(lock)
-    with lock, queue.get(timeout=PATIENCE) as again:
-        assert again
-    with fiber.Pool(1) as pool:
-        assert pool.apply(repr, (lock,)) == "<RLock(None, 0)>"
-
-
 # Holders that die
 
 
