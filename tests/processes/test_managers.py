@@ -285,7 +285,7 @@ LockManager.register("Lock", threading.Lock, AcquirerProxy)
 LockManager.register("Plain", threading.Lock)
 
 
-def test_a_lock_of_threading_that_is_registered_is_fibers(manager: Any) -> None:
+def test_a_registered_lock_of_threading_is_fibers() -> None:
     with LockManager() as manager:
         lock, plain = manager.Lock(), manager.Plain()
         call(acquire, lock)
