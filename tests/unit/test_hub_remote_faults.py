@@ -16,7 +16,6 @@ import pytest
 
 import fiber
 from census import wait_until
-from fiber._hub import client
 from fiber._hub.client import ObjectUnreachable
 from fiber._hub.local import LocalCounter
 from fiber.connection import Connection
@@ -24,21 +23,6 @@ from hosts import Far, Hosts, Wire, background, objects_kept
 from patience import PATIENCE
 
 # Processes that die, links that break
-
-
-def test_an_interrupted_take_gives_back_only_its_tokens(
-    far: Far, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupted(*arguments: Any) -> None:
-        raise KeyboardInterrupt
-
-    remote = far(LocalCounter.create())
-    with monkeypatch.context() as ctrl_c:
-        ctrl_c.setattr(client.HubStream, "_reply", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            remote.take(None)
-    assert remote.value() == 0
-    remote.close()
 
 
 def test_a_lost_link_ends_every_wait_with_its_reason(hosts: Hosts, far: Far) -> None:

@@ -179,8 +179,8 @@ class HubStream:
         self._number = 0
         self._asked = 0
         """Number of the last request that gets a reply."""
-        self._unsettled: Op | None = None
-        """Operation of a request whose reply is awaited or was given up."""
+        self._unsettled = False
+        """True while a reply is awaited or was given up."""
         self._begun: int | None = None
         """Number of the request that ``begin`` sent and ``finish`` has not read."""
         self._end = "its hub is gone"
@@ -206,7 +206,7 @@ class HubStream:
         """Send a request and wait for the reply; its status is NO after ``timeout`` seconds."""
         _refuse_on_loop()
         number = self._asked = self._next()
-        self._unsettled = operation
+        self._unsettled = True
         try:
             self._send(form.pack(operation, number, *values), buffers, fds)
             reply = self._reply(number, timeout)
@@ -214,9 +214,9 @@ class HubStream:
             raise
         except BaseException:
             # Ctrl-C, or an error of another signal's handler.
-            self.give_up(operation)
+            self.give_up()
             raise
-        self._unsettled = None
+        self._unsettled = False
         return reply
 
     def begin(self, operation: Op, buffers: Sequence[memoryview]) -> None:
@@ -231,19 +231,18 @@ class HubStream:
         number, self._begun = self._begun, None  # after Ctrl-C the reply is not read again
         return None if number is None else self._reply(number, None)
 
-    def give_up(self, operation: Op) -> None:
-        """Give up the reply to the last request, ``operation``.
+    def give_up(self) -> None:
+        """Give up the reply to the last request.
 
         The hub takes back a token that it gave this stream.  ``settle`` finds a reply that was sent
         all the same.
         """
-        self._unsettled = operation
+        self._unsettled = True
         self._send(ONE.pack(Op.SYNC, self._next(), self._asked))
 
-    def settle(self) -> tuple[Op, Reply] | None:
-        """Return a request that was given up and its reply, if the hub replied all the same."""
-        operation = self._unsettled
-        if operation is None:
+    def settle(self) -> Reply | None:
+        """Return the reply to a request that was given up, if the hub replied all the same."""
+        if not self._unsettled:
             return None
         number = self._next()
         self._send(ONE.pack(Op.SYNC, number, self._asked))
@@ -251,8 +250,8 @@ class HubStream:
         while (reply := self.receive()).number != number:
             if reply.status is Status.OK and reply.number == self._asked:
                 late = reply
-        self._unsettled = None
-        return (operation, late) if late is not None else None
+        self._unsettled = False
+        return late
 
     def say(self, operation: Op, *values: int | bytes, form: struct.Struct = HEAD) -> None:
         """Send a request that has no reply."""
@@ -276,7 +275,7 @@ class HubStream:
     @property
     def has_answered(self) -> bool:
         """True if the hub replied to the last request."""
-        return self._asked > 0 and self._unsettled is None
+        return self._asked > 0 and not self._unsettled
 
     def fileno(self) -> int:
         """Return the stream's descriptor."""

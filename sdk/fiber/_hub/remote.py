@@ -104,7 +104,7 @@ class RemoteObject:
         with self._take(self._idle) as stream:
             late = stream.settle()
             if late is not None:
-                self._settled(*late)
+                self._settled(late)
             yield stream
 
     def close(self) -> None:
@@ -153,7 +153,7 @@ class RemoteObject:
         self._idle.clear()
         self._streams.clear()
 
-    def _settled(self, operation: Op, reply: Reply) -> None:
+    def _settled(self, reply: Reply) -> None:
         """Handle the late reply to a request that was given up (Ctrl-C)."""
 
 
@@ -275,7 +275,7 @@ class RemoteChannel(RemoteObject):
         self._watching.clear()
         self._unconfirmed.clear()
 
-    def _settled(self, operation: Op, reply: Reply) -> None:
+    def _settled(self, reply: Reply) -> None:
         if reply.parts:
             self._late.append(reply)
 
@@ -340,10 +340,6 @@ class RemoteCounter(RemoteObject):
         with self.stream() as stream:
             reply = stream.ask(Op.CHANGED, since, form=ONE, timeout=timeout)
             return reply.status is Status.OK
-
-    def _settled(self, operation: Op, reply: Reply) -> None:
-        if operation is Op.TAKE:
-            self.add(1)
 
 
 @contextmanager

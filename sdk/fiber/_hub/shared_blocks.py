@@ -117,7 +117,7 @@ class RemoteSemaphore(RemoteObject):
             self._idle.append(stream)
             raise
         except BaseException:
-            stream.give_up(Op.ACQUIRE)
+            stream.give_up()
             self._idle.append(stream)
             raise
         if reply.status is not Status.OK:
