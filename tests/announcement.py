@@ -15,7 +15,7 @@ from cluster.ability import Choice
 
 SUPPORTED = ("3.11", "3.12", "3.13")
 # Minutes on two idle processors. Correct them where they are far off.
-_MODULES, _OTHER_PYTHON, _PROGRAMS, _CONFORMANCE, _CLUSTER = 6, 2, 7, 6, 20
+_MODULES, _OTHER_PYTHON, _BESIDE, _CLUSTER = 4, 2, 24, 26
 
 
 def announcement(others: Sequence[str], environment: Mapping[str, str]) -> str:
@@ -40,13 +40,12 @@ def _parts(others: Sequence[str], environment: Mapping[str, str]) -> Iterator[tu
     choice, _ = ability.choose(environment)
     if choice is Choice.OWN and build.missing("kubernetes"):
         yield "building Kubernetes for the operator's scenarios, this time only", build.minutes()
-    yield "faults, processes, examples, the chart", _PROGRAMS
-    conformance = "conformance with each backend"
+    beside = "faults, processes, examples, the chart, and conformance with each backend"
     if choice is Choice.NONE:
-        yield conformance, _CONFORMANCE
+        yield beside, _BESIDE
     else:
         scenarios = f"the operator's scenarios and programs on pods, on {choice.value}"
-        yield f"{scenarios}; beside them {conformance}", _CLUSTER
+        yield f"{scenarios}; beside them {beside}", _CLUSTER
 
 
 def _left_out(others: Sequence[str], environment: Mapping[str, str]) -> Iterator[str]:
