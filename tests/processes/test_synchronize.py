@@ -16,6 +16,7 @@ import pytest
 import fiber
 from fiber import synchronize
 from patience import PATIENCE
+from processes.test_loopback import running
 
 
 def start(target: Callable[..., Any], *args: Any) -> fiber.Process:
@@ -50,6 +51,27 @@ def test_a_notify_with_a_negative_number_wakes_no_thread() -> None:
     with condition:
         condition.notify(-1)
         assert not condition.wait(0.01)
+
+
+def hold_and_fork(lock: Any, forks: Any) -> None:
+    lock.acquire()
+    fork = os.fork()
+    if fork:
+        forks.put(fork)
+    signal.pause()
+
+
+def test_a_fork_of_a_dead_holder_on_another_host_does_not_keep_the_lock() -> None:
+    with running(agents=1):
+        lock, forks = fiber.Lock(), fiber.SimpleQueue()
+        holder = start(hold_and_fork, lock, forks)
+        fork = forks.get()
+        try:
+            holder.kill()
+            assert lock.acquire(timeout=PATIENCE)
+            os.kill(fork, 0)
+        finally:
+            os.kill(fork, signal.SIGKILL)
 
 
 def in_turn(semaphore: Any, inside: Any, times: int) -> None:

@@ -88,6 +88,22 @@ def test_a_lock_has_one_holder_at_a_time(make: Callable[[], Any]) -> None:
         assert "SomeOtherProcess" in repr(lock)
 
 
+def test_a_try_does_not_wait_for_the_mutex_of_a_revival(one: SharedSemaphore) -> None:
+    entered, leave = threading.Event(), threading.Event()
+
+    def hold_mutex() -> None:
+        one._mutex.run(lambda: (entered.set(), leave.wait(PATIENCE)))
+
+    holder = threading.Thread(target=hold_mutex)
+    holder.start()
+    entered.wait(PATIENCE)
+    tried = [one.try_acquire(), leave.is_set() or holder.is_alive()]
+    leave.set()
+    holder.join(PATIENCE)
+    assert tried == [False, True]
+    assert one.try_acquire()
+
+
 @pytest.mark.parametrize("make", [fiber.Lock, fiber.RLock, fiber.Condition])
 def test_an_invalid_timeout_is_refused_by_a_free_lock_too(make: Callable[[], Any]) -> None:
     lock = make()

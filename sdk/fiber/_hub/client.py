@@ -11,6 +11,7 @@ import os
 import socket
 import struct
 import time
+import weakref
 from collections.abc import Callable, Iterable, Sequence
 from typing import Protocol
 
@@ -139,8 +140,14 @@ def _refuse_on_loop() -> None:
 
 
 def _after_fork() -> None:
-    """Use the parent's hub from outside, after a fork that Fiber did not make."""
+    """Use the parent's hub from outside, after a fork that Fiber did not make.
+
+    A copy of a stream's socket would keep the stream, and a lock that it keeps, when the parent
+    dies.
+    """
     global _local_hub, _address
+    for stream in list(_streams):
+        stream.close()
     if _local_hub is not None:
         _address, _local_hub = _local_hub.known_address, None
 
@@ -148,6 +155,7 @@ def _after_fork() -> None:
 _address: HubAddress | None = None
 _local_hub: LocalHub | None = None
 _starter: Callable[[], object] | None = None
+_streams: weakref.WeakSet[HubStream] = weakref.WeakSet()
 os.register_at_fork(after_in_child=_after_fork)
 
 
@@ -185,6 +193,7 @@ class HubStream:
         """Number of the request that ``begin`` sent and ``finish`` has not read."""
         self._end = "its hub is gone"
         self._sock, to_its_hub = _dial(home)
+        _streams.add(self)
         try:
             for part in (*to_its_hub, protocol.hello(home.key), *greeting):
                 packet.send(self._sock, part)

@@ -62,21 +62,21 @@ class RequestRefused(Exception):
 class PendingRequest:
     """Request that waits for its reply, which is sent once."""
 
-    __slots__ = ("_granted", "_handler", "_number")
+    __slots__ = ("_handler", "_number", "_on_ok")
 
     def __init__(
-        self, handler: ClientHandler, number: int, granted: Callable[[], None] | None = None
+        self, handler: ClientHandler, number: int, on_ok: Callable[[], None] | None = None
     ) -> None:
         self._handler = handler
         self._number = number
-        self._granted = granted
+        self._on_ok = on_ok
 
     def answer(self, status: Status, value: int = 0, buffers: Sequence[memoryview] = ()) -> None:
         """Send the reply."""
         if self._handler.waiting is self:
             self._handler.waiting = None
-        if self._granted is not None and status is Status.OK:
-            self._granted()
+        if self._on_ok is not None and status is Status.OK:
+            self._on_ok()
         self._handler.stream.send(ONE.pack(status, self._number, value), buffers)
 
     @property
@@ -99,7 +99,7 @@ class ClientHandler:
         """Grants that end with the stream."""
         self._holder: str | None = None
         """Name of the process whose token the stream keeps."""
-        self._granted_last: int | None = None
+        self._last_token_request: int | None = None
         """Number of the last request that got a token, while the client may still give it up."""
         self._place: int | None = None
         """Place of the client in the wait list of a condition."""
@@ -129,7 +129,10 @@ class ClientHandler:
         """Do nothing: there is at most one reply at a time."""
 
     def on_closed(self, reason: str) -> None:
-        """Note that the client has ended."""
+        """Return the token that the stream keeps: the client has ended.
+
+        The next acquirer gets the name of the dead holder.
+        """
         if self._holder is not None:
             self._semaphore().abandon(self._holder)
             self._holder = None
@@ -140,6 +143,7 @@ class ClientHandler:
         self._end(reason)
 
     def _end(self, reason: str) -> None:
+        # The token returns without a holder's name, since the client may live.
         self._leave()
         self.stream.finish(reason)
 
@@ -286,9 +290,9 @@ class ClientHandler:
         """
         if self._holder is not None:
             self._give_back()
-        elif ONE.unpack(message.payload)[2] == self._granted_last:
+        elif ONE.unpack(message.payload)[2] == self._last_token_request:
             self._semaphore().release()
-        self._granted_last = None
+        self._last_token_request = None
         self._request(message).answer(Status.OK)
 
     # A channel
@@ -404,11 +408,11 @@ class ClientHandler:
         """Take a token, which the stream keeps."""
         holder = bytes(message.buffers[0][:_NAME_BYTES]).decode(errors="replace")
         request = self._request(message)
-        self._semaphore().acquire(request, partial(self._granted_to, holder, request.number))
+        self._semaphore().acquire(request, partial(self._token_taken, holder, request.number))
 
-    def _granted_to(self, holder: str, number: int, keeps: bool) -> None:
+    def _token_taken(self, holder: str, number: int, keeps: bool) -> None:
         self._holder = holder if keeps else None
-        self._granted_last = number
+        self._last_token_request = number
 
     def _give_back(self) -> None:
         if self._holder is not None:

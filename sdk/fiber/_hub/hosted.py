@@ -4,8 +4,8 @@ All classes run on the loop thread.  A hub takes a message out of a channel, or 
 only for a request that waits for it, and replies at once.  So a client that dies has taken no more
 than it requested.
 
-``HostedSemaphore`` holds tokens for processes of other hosts.  The loop never waits: while such a
-process waits for a token, each release rings the hub's doorbell.  Requests get tokens in their
+``HostedSemaphore`` holds tokens for processes of other hosts.  The loop does not wait: while such
+a process waits for a token, each release rings the hub's doorbell.  Requests get tokens in their
 order.  ``HostedWaitList`` is the wait list of a condition.
 """
 
@@ -311,8 +311,8 @@ class HostedSemaphore:
             self._loop.call_later(_RELEASE_AGAIN, self.release)
 
     def abandon(self, holder: str) -> None:
-        """Return the token of a process that has ended, with a warning."""
-        self._semaphore.abandon(holder)
+        """Note the dead holder for the next acquirer, warn, and return its token."""
+        self._semaphore.note_death(holder)
         with contextlib.suppress(RuntimeWarning):  # as an error it would end the hub
             warn_of(holder)
         self.release()

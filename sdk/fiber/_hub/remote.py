@@ -1,4 +1,6 @@
-"""Channels and counters of another host: each operation is a request to the hub there.
+"""Objects of other hosts: the base class, channels and counters.
+
+Each operation is a request to the hub of that host.
 
 Each operation uses a stream alone, so threads that wait do not block each other.  An object has as
 many streams as threads have ever used it at the same time.

@@ -4,8 +4,8 @@
   has the memory itself.  Another host has a replica, which its hub keeps in step
   (``fiber._hub.replicas``).
 * A semaphore of another host is a ``RemoteSemaphore``.  The hub there holds tokens for this
-  process, and a stream keeps each token.  The hub gives the token back when the stream ends, and
-  the kernel ends the stream when this process dies.
+  process, and a stream keeps each token.  The hub gives the token back when the stream ends.
+  When this process dies, the kernel closes its socket, and this host's hub ends the stream.
 * A wait list of another host is a ``RemoteWaitList``.  A stream keeps each place in it.
 """
 

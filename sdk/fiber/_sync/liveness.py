@@ -17,7 +17,7 @@ import functools
 import os
 import time
 from collections.abc import Callable
-from typing import TypeVar
+from typing import TypeVar, cast
 
 _PID = (1 << 31) - 1
 _START = (1 << 32) - 1
@@ -92,12 +92,21 @@ class RobustMutex:
         _check(_libc.pthread_mutex_init(self._address, _attributes()))
 
     def run(self, action: Callable[[], _Result]) -> _Result:
-        """Call ``action`` while this process holds the mutex; return its result."""
+        """Call ``action`` while this thread holds the mutex; return its result."""
+        return cast("_Result", self._run(action, wait=True))
+
+    def try_run(self, action: Callable[[], _Result]) -> _Result | None:
+        """Do as ``run`` does, but return None at once if another thread holds the mutex."""
+        return self._run(action, wait=False)
+
+    def _run(self, action: Callable[[], _Result], *, wait: bool) -> _Result | None:
         outcomes: list[int] = []
         try:
             # One step locks and notes the outcome: no signal's handler runs in between.
             outcomes.extend(map(_libc.pthread_mutex_trylock, (self._address,)))
             while outcomes[-1] == errno.EBUSY:
+                if not wait:
+                    return None
                 time.sleep(_NAP)
                 outcomes.extend(map(_libc.pthread_mutex_trylock, (self._address,)))
             if outcomes[-1] == errno.EOWNERDEAD:

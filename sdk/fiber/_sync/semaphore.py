@@ -6,11 +6,13 @@ also has *slots*.  A process has a slot for each token that it holds or is about
 
     semaphore │ mutex │ attention, … │ slot │ slot │ …          slot: state, process, its name
 
-Only the thread that has removed a slot from its process's lists writes the slot's state::
+``attention`` has three flags: stop, abandoned, and listens.  A thread that finds ``stop`` set puts
+its slot's state back, and waits until the revival is over.  Only the thread that has removed a slot
+from its process's lists writes the slot's state::
 
     acquire                               release
       state = BUSY                          state = BUSY
-      stop set?  then wait                  stop set?  then wait
+      stop set?  then step back             stop set?  then step back
       take a token                          return the token
       state = HELD                          state = IDLE
 
@@ -224,8 +226,9 @@ class SharedSemaphore:
         except IndexError:
             slot = 0
         if not slot:
-            self._mutex.run(self._give_untracked)
-            return True
+            if wait:
+                return self._mutex.run(self._give_untracked)
+            return self._mutex.try_run(self._give_untracked) or False
         try:
             words[slot] = _BUSY
             while words[_ATTENTION] & _IS_STOPPED:
@@ -254,10 +257,18 @@ class SharedSemaphore:
         self._bytes[_LISTENS] = listens
 
     def try_acquire(self) -> bool | Abandoned:
-        """Take a token if there is one.  Never wait, and look for no lost tokens."""
+        """Take a token if there is one.  Look for no lost tokens, and do not wait for a revival.
+
+        It waits for one only if more tokens are in use than there are slots.
+        """
+        if not self._idle:
+            slot = self._mutex.try_run(self._claim)
+            if slot is None:
+                return False
+            self._idle += (slot,)
         return self._try_acquire()
 
-    def abandon(self, holder: str) -> None:
+    def note_death(self, holder: str) -> None:
         """Note for the next acquirer that the process ``holder`` ended with a token."""
         start, size = 8 * _DEAD.start, 8 * len(_DEAD)
         self._bytes[start : start + size] = holder.encode()[:size].ljust(size, b"\0")
@@ -298,12 +309,13 @@ class SharedSemaphore:
             self._idle += (slot,)
         return taken
 
-    def _give_untracked(self) -> None:
+    def _give_untracked(self) -> bool:
         """Return a token that this process has not acquired.  The caller holds the mutex."""
         self._give()
         self._words[_IS_UNTRACKED] = True
         if self._words[_ATTENTION] & _IS_LISTENED_TO:
             self._ring()
+        return True
 
     def _leave(self, slot: int) -> None:
         """Mark a slot as LEFT after an interrupt.  A revival finds out if its token is lost."""
@@ -384,7 +396,7 @@ class SharedSemaphore:
             if gone and lost > 0 and not words[_IS_UNTRACKED]:
                 released = self._names(gone)
                 if released:
-                    self.abandon(released[-1])
+                    self.note_death(released[-1])
                 # By another SemLock: the one of this object counts the tokens of this process.
                 give = self._semlock(COUNTING).release
                 for _ in range(lost):
@@ -424,7 +436,8 @@ class SharedSemaphore:
 
     def _warn(self, released: list[str]) -> None:
         for process in dict.fromkeys(released):
-            warn_of(process, stacklevel=8)  # the caller of acquire()
+            # The caller of acquire(); for a manager's lock, Fiber's own line.
+            warn_of(process, stacklevel=8)
 
     # Slots
 
