@@ -150,7 +150,7 @@ class PinsToAnyone(Ledger):
 
 
 class NeverFinishes(Ledger):
-    def _finish(self, job: Job) -> bool:
+    def _drop_if_finished(self, job: Job) -> bool:
         return False
 
 
