@@ -1,6 +1,6 @@
 """Client of the API server: JSON documents go in and come out; nothing is cached.
 
-A call that ends in ``Unavailable`` may have been carried out.  The client never retries: the caller
+A call that ends in ``Transient`` may have been carried out.  The client never retries: the caller
 plans again, because a request that was right a minute ago may be wrong now.
 """
 
@@ -12,7 +12,7 @@ import os
 import time
 from collections import OrderedDict, deque
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import aiohttp
 from kubernetes.aio import config
@@ -20,16 +20,23 @@ from kubernetes.aio.client.api_client import ApiClient
 from kubernetes.aio.client.configuration import Configuration
 from kubernetes.aio.client.rest import RESTClientObject, RESTResponse
 
-from fiber_api import names
+from fiber_api.rest import (
+    ApiError,
+    Body,
+    Expired,
+    NotServed,
+    ResourceType,
+    ServerUnreachable,
+    Transient,
+    Unauthorized,
+    event_of,
+)
 from fiber_operator.responses import (
     METADATA,
     METADATA_LIST,
     PIECE,
-    Body,
     ListReader,
-    Unavailable,
-    document_of,
-    event_of,
+    limited_document_of,
     object_of,
 )
 
@@ -37,7 +44,6 @@ __all__ = [
     "Cluster",
     "Configuration",
     "Permit",
-    "ResourceType",
     "load_configuration",
     "open_session",
 ]
@@ -46,6 +52,10 @@ T = TypeVar("T")
 Observer = Callable[[str, str, str, float], None]
 """Called after each call with verb, resource, HTTP status or kind of failure, and seconds."""
 Permit = Callable[[], float]
+
+MAY_PASS = (Transient, Unauthorized, NotServed)
+"""Errors after which the same call may succeed.  The token of an account is read again each minute,
+and the chart may install the definition of FiberPools just now."""
 
 PAGE = 500
 """Objects in a page of a list."""
@@ -67,39 +77,15 @@ _METADATA_OF_ONE = f"{_JSON};as={METADATA};g=meta.k8s.io;v=v1"
 _METADATA = f"{_JSON};as={METADATA_LIST};g=meta.k8s.io;v=v1"
 
 
-class ResourceType(NamedTuple):
-    """Type of objects, as the API's paths name it."""
-
-    group: str
-    version: str
-    plural: str
-
-    def path(self, namespace: str | None, name: str = "", subresource: str = "") -> str:
-        """Return the path of one object, or without a name of all in ``namespace`` (None: all)."""
-        start = f"/apis/{self.group}/{self.version}" if self.group else f"/api/{self.version}"
-        scope = f"namespaces/{namespace}" if namespace is not None else ""
-        return "/".join(part for part in (start, scope, self.plural, name, subresource) if part)
-
-
-POOLS = ResourceType(names.GROUP, names.VERSION, names.PLURAL)
-PODS = ResourceType("", "v1", "pods")
-SERVICES = ResourceType("", "v1", "services")
-SECRETS = ResourceType("", "v1", "secrets")
-EVENTS = ResourceType("", "v1", "events")
-SLICES = ResourceType("discovery.k8s.io", "v1", "endpointslices")
-BUDGETS = ResourceType("policy", "v1", "poddisruptionbudgets")
-LEASES = ResourceType("coordination.k8s.io", "v1", "leases")
-
-
 async def _document(response: RESTResponse, what: str) -> Body:
-    return document_of(response.status, response.headers, await response.read(), what)
+    return limited_document_of(response.status, response.headers, await response.read(), what)
 
 
 async def _success(response: RESTResponse, what: str) -> None:
     """Raise the error of a response that is no success; do not decode the others."""
     data = await response.read()
     if not 200 <= response.status < 300:
-        document_of(response.status, response.headers, data, what)
+        limited_document_of(response.status, response.headers, data, what)
 
 
 class Cluster:
@@ -136,14 +122,12 @@ class Cluster:
         """Raise the error of ``permit`` if this process may not write now."""
         self._permit()
 
-    async def read_metadata(self, resource: ResourceType, namespace: str, name: str) -> Body:
-        """The metadata of the object as it is now."""
-        answer = await self._call("get", resource, namespace, name, accept=_METADATA_OF_ONE)
-        return object_of(answer, name, f"get {resource.plural} {name}")
-
-    async def read(self, resource: ResourceType, namespace: str, name: str) -> Body:
+    async def read(
+        self, resource: ResourceType, namespace: str, name: str, *, only_metadata: bool = False
+    ) -> Body:
         """Return the current object, not one from a cache."""
-        answer = await self._call("get", resource, namespace, name)
+        accept = _METADATA_OF_ONE if only_metadata else _JSON
+        answer = await self._call("get", resource, namespace, name, accept=accept)
         return object_of(answer, name, f"get {resource.plural} {name}")
 
     async def list_metadata(
@@ -157,9 +141,7 @@ class Cluster:
 
         try:
             await self._pages(resource, namespace, take, {"limit": str(PAGE)}, _METADATA)
-        except Unavailable as error:
-            if error.status != 410:
-                raise
+        except Expired:
             # The request for the next page came too late.  A list without pages cannot be too late.
             kept.clear()
             await self._pages(resource, namespace, take, {}, _METADATA)
@@ -235,7 +217,7 @@ class Cluster:
         """Call ``take`` with the type and the object of each event, until the watch ends.
 
         ``opened`` is called once the API server has accepted the watch.  A version that the API
-        server has forgotten is an Unavailable with status 410.
+        server has forgotten raises ``Expired``.
         """
         query = {
             "watch": "true",
@@ -334,8 +316,8 @@ class Cluster:
             except (TimeoutError, aiohttp.ClientError, OSError) as error:
                 # A TimeoutError has no message.
                 code = "timeout" if isinstance(error, TimeoutError) else "connection"
-                raise Unavailable(str(error) or "no answer in time", what=what) from error
-            except Unavailable as error:
+                raise ServerUnreachable(str(error) or "no answer in time", what=what) from error
+            except ApiError as error:
                 code = code if error.status else "garbage"
                 raise
             finally:

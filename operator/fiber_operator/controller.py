@@ -19,8 +19,20 @@ from typing import Any
 
 from fiber_api import names
 from fiber_api.names import Reason
+from fiber_api.rest import (
+    PODS,
+    POOLS,
+    ApiError,
+    Body,
+    Conflict,
+    Forbidden,
+    Invalid,
+    NotFound,
+    ServerUnreachable,
+    Transient,
+)
 from fiber_api.v1alpha1 import FiberPool, InvalidPool
-from fiber_operator.cluster import PODS, POOLS, Cluster
+from fiber_operator.cluster import Cluster
 from fiber_operator.creation import Creation, CreationPace, Draw, Order, draw_suffix
 from fiber_operator.dependents import Dependents, DependentsReconciler
 from fiber_operator.events import EventRecorder, pod_warnings
@@ -41,17 +53,7 @@ from fiber_operator.planning.plans import (
     PoolEvent,
 )
 from fiber_operator.planning.pods import PodState, PodView
-from fiber_operator.responses import (
-    ApiError,
-    Body,
-    Conflict,
-    Gone,
-    Invalid,
-    Oversized,
-    Refused,
-    TooMany,
-    Unavailable,
-)
+from fiber_operator.responses import Oversized
 from fiber_operator.workqueue import Key, Result
 
 log = logging.getLogger(__name__)
@@ -162,7 +164,7 @@ class Applier:
         body = podspec.pod(pool, name, state.address or "", self._requests)
         try:
             await self._cluster.create(PODS, pool.metadata.namespace, body, dry_run=True)
-        except (Refused, Invalid) as error:
+        except (Forbidden, Invalid) as error:
             if any(words in error.message for words in _NO_VERDICTS):
                 # The creation of the first pods will judge the template.
                 state.accepted, state.creation = plan.template_hash, None
@@ -218,7 +220,7 @@ class Applier:
             work.state.written = mapping(answer, "status")
         except Oversized:
             work.state.blind_status = work.plan.status
-        except (Refused, Invalid) as error:
+        except (Forbidden, Invalid) as error:
             event = PoolEvent("Warning", Reason.FORBIDDEN, messages.unwritable_status(error))
             self._tell(work, [event])
             raise
@@ -237,7 +239,7 @@ class Applier:
             await self._cluster.delete(
                 POOLS, *work.key, uid=work.state.uid, resource_version=version
             )
-        except (Gone, Conflict):
+        except (NotFound, Conflict):
             return  # its master may have changed it meanwhile; the next reconcile decides
         self._tell(work, work.plan.events)
 
@@ -280,7 +282,7 @@ class Applier:
             for deletion, result in zip(batch, results, strict=True):
                 if isinstance(result, Conflict):
                     as_planned = False
-                elif isinstance(result, BaseException) and not isinstance(result, Gone):
+                elif isinstance(result, BaseException) and not isinstance(result, NotFound):
                     if not isinstance(result, ApiError):
                         raise result
                     failure = failure or result
@@ -296,7 +298,7 @@ class Applier:
         """Return True if the pool has changed since the plan was made."""
         try:
             document = await self._cluster.read(POOLS, *work.key)
-        except Gone:
+        except NotFound:
             return True
         return _version(document) != _version(work.document)
 
@@ -309,7 +311,7 @@ class Applier:
                 uid=deletion.uid,
                 resource_version=deletion.resource_version,
             )
-        except Gone:
+        except NotFound:
             self._informer.deleted(namespace, deletion.uid, gone=True)
             raise
         self._informer.deleted(namespace, deletion.uid, gone=False)
@@ -394,7 +396,7 @@ class Controller:
         except ApiError as error:
             outcome = type(error).__name__.lower()
             log.warning("%s", error, extra=about(*key, reason=error.reason or outcome))
-            rest = error.retry_after if isinstance(error, TooMany) else 0.0
+            rest = error.retry_after if isinstance(error, Transient) else 0.0
             result = Result(failed=True, rest=rest)
         finally:
             self._metrics.reconciled(outcome, time.perf_counter() - started)
@@ -441,12 +443,12 @@ class Controller:
         """Return the pool as it is now, and the memory about it; None if it is gone."""
         try:
             document, oversized = await self._document(key)
-        except Gone:
+        except NotFound:
             self._drop(key)
             return None
         uid = text(mapping(document, "metadata").get("uid"))
         if not uid:
-            raise Unavailable("the answer has no uid", what=f"get fiberpools {key.name}")
+            raise ServerUnreachable("the answer has no uid", what=f"get fiberpools {key.name}")
         state = self._states.get(key)
         if state is None or state.uid != uid:
             state = self._states[key] = PoolMemory(uid)
@@ -464,7 +466,7 @@ class Controller:
             return await self._cluster.read(POOLS, *key), ""
         except Oversized as error:
             wrong = f"spec: {error.message}, so the operator does not read it"
-        return await self._cluster.read_metadata(POOLS, *key), wrong
+        return await self._cluster.read(POOLS, *key, only_metadata=True), wrong
 
     async def _pass(self, work: Work) -> Result:
         try:

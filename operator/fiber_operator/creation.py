@@ -12,17 +12,18 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from fiber_api import names
-from fiber_operator.cluster import PODS, Cluster
-from fiber_operator.planning.pods import PodView
-from fiber_operator.responses import (
+from fiber_api.rest import (
+    PODS,
     ApiError,
     Body,
     Conflict,
+    Forbidden,
     Invalid,
-    Refused,
-    TooMany,
-    Unavailable,
+    TooManyRequests,
+    Transient,
 )
+from fiber_operator.cluster import Cluster
+from fiber_operator.planning.pods import PodView
 from fiber_operator.workqueue import Key
 
 Draw = Callable[[], str]
@@ -157,12 +158,12 @@ class Creation:
     async def _create(self, name: str) -> None:
         try:
             document = await self._have(name)
-        except (Refused, Invalid) as error:
+        except (Forbidden, Invalid) as error:
             self._done.refusal = self._done.refusal or error
         except ApiError as error:
-            if isinstance(error, TooMany):
+            if isinstance(error, TooManyRequests):
                 self._done.wait = max(self._done.wait, error.retry_after)
-            elif isinstance(error, Unavailable):
+            elif isinstance(error, Transient):
                 self._pace.unsure.append(name)
             self._done.failure = self._done.failure or error
         except asyncio.CancelledError:

@@ -16,12 +16,24 @@ from typing import Any
 
 from fiber_api import identity, names
 from fiber_api.names import Reason
+from fiber_api.rest import (
+    BUDGETS,
+    SECRETS,
+    SERVICES,
+    SLICES,
+    ApiError,
+    Body,
+    Conflict,
+    Forbidden,
+    Invalid,
+    NotFound,
+    ResourceType,
+)
 from fiber_api.v1alpha1 import FiberPool, MasterSpec
-from fiber_operator.cluster import BUDGETS, SECRETS, SERVICES, SLICES, Cluster, ResourceType
+from fiber_operator.cluster import MAY_PASS, Cluster
 from fiber_operator.planning import manifests, messages
 from fiber_operator.planning.documents import items, mapping, seconds, text
 from fiber_operator.planning.plans import Obstacle
-from fiber_operator.responses import ApiError, Body, Conflict, Gone, Invalid, Refused, Unavailable
 
 CHECK_INTERVAL = 50.0
 
@@ -157,7 +169,7 @@ class DependentsReconciler:
             raise
         except ApiError as error:
             obstacle = messages.object_obstacle(error, what)
-            return _Found(None, obstacle, error if isinstance(error, Unavailable) else None)
+            return _Found(None, obstacle, error if isinstance(error, MAY_PASS) else None)
 
     async def _secret(self, pool: FiberPool) -> str | None:
         if (brought := pool.spec.credentials_secret_name) is not None:
@@ -189,7 +201,7 @@ class DependentsReconciler:
             raise _wrong_secret(name, why, reserved)
         try:
             existing = await self._cluster.read(SECRETS, pool.metadata.namespace, name)
-        except Gone:
+        except NotFound:
             return  # the pods wait for it
         if (other := manifests.other_owner(pool, existing)) is not None:
             raise _wrong_secret(name, f"which is the Secret of the FiberPool {other}", other)
@@ -266,7 +278,7 @@ class DependentsReconciler:
         namespace = pool.metadata.namespace
         try:
             existing = await self._cluster.read(BUDGETS, namespace, name)
-        except (Gone, Refused):
+        except (NotFound, Forbidden):
             return  # without the right to read one, the operator has made none
         if manifests.is_ours(pool, existing):
             uid = str(mapping(existing, "metadata").get("uid"))
@@ -286,7 +298,7 @@ class DependentsReconciler:
                     raise
         try:
             existing = await self._cluster.read(resource, namespace, name)
-        except Gone:
+        except NotFound:
             # A Conflict means that it was created between the two calls.
             return await self._cluster.create(resource, namespace, new())
         if not manifests.is_ours(pool, existing):

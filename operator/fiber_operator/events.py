@@ -22,13 +22,13 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from fiber_api import names
-from fiber_operator.cluster import EVENTS, Cluster
+from fiber_api.rest import EVENTS, ApiError, Body
+from fiber_operator.cluster import Cluster
 from fiber_operator.logs import about
 from fiber_operator.operator_leases import NotLeader
 from fiber_operator.planning.documents import mapping, seconds, text
 from fiber_operator.planning.plans import PoolEvent
 from fiber_operator.planning.pods import PodView
-from fiber_operator.responses import ApiError, Body
 from fiber_operator.workqueue import Key
 
 log = logging.getLogger(__name__)

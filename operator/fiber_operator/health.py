@@ -14,10 +14,10 @@ from dataclasses import dataclass
 
 from aiohttp import web
 
-from fiber_operator.cluster import PODS
+from fiber_api.rest import PODS, ApiError
 from fiber_operator.metrics import CONTENT_TYPE, Metrics
 from fiber_operator.operator_leases import LeaderElector
-from fiber_operator.responses import ApiError, complaint
+from fiber_operator.responses import complaint
 from fiber_operator.resync import Resync
 from fiber_operator.watches import WATCHED
 from fiber_operator.workqueue import WorkQueue

@@ -18,6 +18,7 @@ the cache.
 from __future__ import annotations
 
 import asyncio
+import copy
 import dataclasses
 import logging
 from collections import OrderedDict
@@ -25,10 +26,11 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from fiber_api import names
-from fiber_operator.cluster import PODS, Cluster
+from fiber_api.rest import PODS, ApiError, Body, Expired, Forbidden, ServerUnreachable
+from fiber_operator.cluster import Cluster
 from fiber_operator.planning.documents import mapping, text
 from fiber_operator.planning.pods import PodState, PodView, observe, worker_container
-from fiber_operator.responses import Answered, ApiError, Body, Refused, Unavailable
+from fiber_operator.responses import Answered
 from fiber_operator.workqueue import Key
 
 PAUSES = (0.5, 1.0, 2.0, 5.0, 15.0)
@@ -148,9 +150,9 @@ class _Reflector:
             async with asyncio.timeout(SYNC_TIMEOUT):
                 await self._settled.wait()
         except TimeoutError:
-            raise Unavailable("the pods were not listed in time", what="list pods") from None
+            raise ServerUnreachable("the pods were not listed in time", what="list pods") from None
         if self._failure is not None:
-            raise self._failure.again()
+            raise copy.copy(self._failure)  # raised twice, it would keep what raised it alive
         return list(self._pools.get((namespace, uid), {}).values())
 
     def refresh(self) -> None:
@@ -187,10 +189,10 @@ class _Reflector:
 
     async def _recover(self, error: ApiError) -> None:
         """Report a failure if it is the second in a row, and pause before the next attempt."""
-        again, expired = self._failures > 0, error.status == 410
+        again, expired = self._failures > 0, isinstance(error, Expired)
         self._failures += 1
         # A watch that breaks off once is begun again, and the pods are known meanwhile.
-        if again or isinstance(error, Refused):
+        if again or isinstance(error, Forbidden):
             self._failure = error
             self._settled.set()
             self._answered(self._request_name("watch"), error)
@@ -205,7 +207,7 @@ class _Reflector:
         began, version = _now(), self._version
         refreshed = await self._watch()
         if not refreshed and self._version == version and _now() - began < SHORT:
-            raise Unavailable("the watch ended at once", what=self._request_name("watch"))
+            raise ServerUnreachable("the watch ended at once", what=self._request_name("watch"))
 
     async def _watch(self) -> bool:
         """Watch until the watch ends; return True if a refresh ended it."""
@@ -283,7 +285,7 @@ class _Reflector:
     def _uid(self, document: Body) -> str:
         uid = text(mapping(document, "metadata").get("uid"))
         if not uid:
-            raise Unavailable("a pod has no uid", what=self._request_name("watch"))
+            raise ServerUnreachable("a pod has no uid", what=self._request_name("watch"))
         return uid
 
     def _show(self, uid: str, document: Body) -> None:

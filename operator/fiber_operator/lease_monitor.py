@@ -19,11 +19,11 @@ from itertools import zip_longest
 from typing import NamedTuple
 
 from fiber_api.names import ANNOTATION_CONNECTED
-from fiber_operator.cluster import LEASES, Cluster
+from fiber_api.rest import LEASES, ApiError, Forbidden, NotFound
+from fiber_operator.cluster import Cluster
 from fiber_operator.logs import about
 from fiber_operator.planning.documents import mapping, text
 from fiber_operator.planning.plans import LeaseVerdict
-from fiber_operator.responses import ApiError, Gone, Refused
 from fiber_operator.workqueue import Key
 
 log = logging.getLogger(__name__)
@@ -138,12 +138,12 @@ class LeaseMonitor:
             lease = await self._cluster.read(LEASES, key.namespace, watched.lease.name)
             version = text(mapping(lease, "metadata").get("resourceVersion"))
             connected = connected_in(lease)
-        except Gone:
+        except NotFound:
             version = ""  # as if it did not change: the program may still make it
         except ApiError as error:
             log.warning("the master's Lease cannot be read: %s", error, extra=about(*key))
             watched.restart_clock(self._now())
-            if isinstance(error, Refused):
+            if isinstance(error, Forbidden):
                 watched.version = None
                 self._conclude(key, watched, LeaseVerdict(unreadable=error.message))
             return

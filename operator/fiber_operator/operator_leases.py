@@ -22,10 +22,11 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from fiber_api import names
+from fiber_api.rest import LEASES, ApiError, Body, Conflict, NotFound, ServerUnreachable
 from fiber_api.times import format_micro_time
-from fiber_operator.cluster import LEASES, Cluster
+from fiber_operator.cluster import Cluster
 from fiber_operator.logs import about
-from fiber_operator.responses import ApiError, Body, Conflict, Gone, Unavailable, complaint
+from fiber_operator.responses import complaint
 
 log = logging.getLogger(__name__)
 
@@ -142,7 +143,7 @@ class LeaderElector:
                 self._lease = await self._read()
             try:
                 await self._take_or_renew(started)
-            except (Conflict, Gone):
+            except (Conflict, NotFound):
                 # Another process wrote it, or the answer to this one was lost: read the holder.
                 self._lease = await self._read()
                 await self._take_or_renew(started)
@@ -178,7 +179,7 @@ class LeaderElector:
     async def _read(self) -> Body | None:
         try:
             return await self._cluster.read(LEASES, self._namespace, self._name)
-        except Gone:
+        except NotFound:
             return None
 
     def _may_take(self, lease: Body | None) -> bool:
@@ -221,7 +222,7 @@ class LeaderElector:
         version = lease["metadata"].get("resourceVersion")
         if not version:
             # Without it this write could replace the Lease of another process.
-            raise Unavailable("the Lease has no resourceVersion")
+            raise ServerUnreachable("the Lease has no resourceVersion")
         body["metadata"]["resourceVersion"] = version
         return await self._cluster.replace(LEASES, self._namespace, self._name, body)
 
@@ -317,7 +318,7 @@ class Heartbeat:
         }
         try:
             await self._cluster.patch(LEASES, where, names.SERVING_LEASE, {"spec": spec})
-        except Gone:
+        except NotFound:
             await self._cluster.create(LEASES, where, _serving_lease(spec))
 
 

@@ -9,10 +9,11 @@ import asyncio
 import logging
 from collections.abc import Callable
 
-from fiber_operator.cluster import POOLS, Cluster
+from fiber_api.rest import POOLS, ApiError, Body
+from fiber_operator.cluster import Cluster
 from fiber_operator.logs import about
 from fiber_operator.planning.documents import mapping, text
-from fiber_operator.responses import ApiError, Body, complaint
+from fiber_operator.responses import complaint
 from fiber_operator.workqueue import Key, WorkQueue
 
 log = logging.getLogger(__name__)

@@ -15,8 +15,8 @@ from collections.abc import Callable, Coroutine, Mapping
 from typing import Any
 
 from fiber_api.names import CRD_NAME, ConditionType
-from fiber_operator.cluster import POOLS, Cluster, load_configuration
-from fiber_operator.responses import ApiError, Conflict, Gone, Unavailable
+from fiber_api.rest import POOLS, ApiError, Conflict, NotFound
+from fiber_operator.cluster import MAY_PASS, Cluster, load_configuration
 
 PATIENCE = 240.0
 """Seconds for each step.  `helm test` waits longer by default."""
@@ -86,7 +86,7 @@ class Smoke:
         while True:
             try:
                 await self._cluster.create(POOLS, self._namespace, self._manifest)
-            except Gone as error:
+            except NotFound as error:
                 raise Failed(
                     f"{error}. Either the namespace {self._namespace} or the resource type "
                     f"{CRD_NAME} does not exist; the chart installs the latter with "
@@ -94,7 +94,7 @@ class Smoke:
                 ) from error
             except Conflict:
                 return  # an earlier attempt succeeded, and its answer was lost
-            except Unavailable as error:
+            except MAY_PASS as error:
                 await self._wait(str(error))
             except ApiError as error:
                 raise Failed(f"the API server refuses the pool: {error}") from error
@@ -126,9 +126,9 @@ class Smoke:
                     await self._cluster.delete(
                         POOLS, self._namespace, self._name, uid=pool["metadata"]["uid"]
                     )
-                except (Gone, Conflict):
+                except (NotFound, Conflict):
                     continue  # another client deleted it: read it again
-                except Unavailable as error:
+                except MAY_PASS as error:
                     self._last = str(error)
             await self._wait("the pool is being deleted")
 
@@ -136,9 +136,9 @@ class Smoke:
         while True:
             try:
                 return await self._cluster.read(POOLS, self._namespace, self._name)
-            except Gone:
+            except NotFound:
                 return None
-            except Unavailable as error:
+            except MAY_PASS as error:
                 await self._wait(str(error))
             except ApiError as error:
                 raise Failed(f"the API server does not show the pool: {error}") from error

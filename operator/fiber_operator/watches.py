@@ -31,7 +31,8 @@ import aiohttp
 import kopf
 
 from fiber_api import names
-from fiber_operator.cluster import LEASES, PAGE, POOLS, Configuration, open_session
+from fiber_api.rest import LEASES, POOLS, ApiError, Body
+from fiber_operator.cluster import PAGE, Configuration, open_session
 from fiber_operator.lease_monitor import connected_in
 from fiber_operator.planning.documents import mapping, text, whole
 from fiber_operator.responses import (
@@ -39,10 +40,8 @@ from fiber_operator.responses import (
     METADATA_LIST,
     PIECE,
     Answered,
-    ApiError,
-    Body,
     ListReader,
-    document_of,
+    limited_document_of,
 )
 from fiber_operator.workqueue import Key
 
@@ -121,7 +120,7 @@ def tracing(answered: Answered) -> aiohttp.TraceConfig:
             return
         try:
             # aiohttp keeps the body, so kopf can read it again.
-            document_of(response.status, response.headers, await response.read(), what)
+            limited_document_of(response.status, response.headers, await response.read(), what)
         except ApiError as error:
             answered(what, error)
 
@@ -205,14 +204,14 @@ def registry(
         sessions.append(await open_watch_session(configuration, tracing(answered)))
         return kopf.AiohttpSession(server=str(configuration.host), aiohttp_session=sessions[-1])
 
-    @kopf.on.event(names.GROUP, names.VERSION, names.PLURAL, registry=handlers)
+    @kopf.on.event(POOLS.api_version, POOLS.plural, registry=handlers)
     async def pool_event(type: str | None, body: Mapping[str, Any], **_: Any) -> None:
         metadata = mapping(body, "metadata")
         key = Key(text(metadata.get("namespace")), text(metadata.get("name")))
         generation = -1 if type == "DELETED" else whole(metadata.get("generation"), -1)
         notice(key, text(metadata.get("uid")), generation)
 
-    @kopf.on.event(LEASES.group, LEASES.version, LEASES.plural, registry=handlers)
+    @kopf.on.event(LEASES.api_version, LEASES.plural, registry=handlers)
     async def lease_event(type: str | None, body: Mapping[str, Any], **_: Any) -> None:
         metadata = mapping(body, "metadata")
         version = "" if type == "DELETED" else text(metadata.get("resourceVersion"))
@@ -240,7 +239,7 @@ def kopf_settings() -> kopf.OperatorSettings:
     settings.watching.inactivity_timeout = 90
     settings.watching.chunk_size = PAGE
     # Other programs have Leases too, and each node has one.  The label selects those of masters.
-    settings.watching.label_selectors[LEASES] = names.LABEL_POOL_UID
+    settings.watching.label_selectors[LEASES.api_version, LEASES.plural] = names.LABEL_POOL_UID
     # kopf keeps a task for each object for this long.  A thousand Leases would take memory.
     settings.queueing.idle_timeout = 0.05
     settings.queueing.exit_timeout = 0.5

@@ -8,9 +8,18 @@ from typing import Any
 
 import pytest
 
+from fiber_api.rest import (
+    ApiError,
+    Conflict,
+    Invalid,
+    NotFound,
+    NotServed,
+    ResourceType,
+    ServerUnreachable,
+    Unauthorized,
+)
 from fiber_operator import smoke
-from fiber_operator.cluster import Cluster, ResourceType
-from fiber_operator.responses import Conflict, Gone, Invalid, Unavailable
+from fiber_operator.cluster import Cluster
 
 MANIFEST: dict[str, Any] = {
     "metadata": {"namespace": "ns", "name": "smoke-x"},
@@ -48,11 +57,13 @@ class Pools(Cluster):
         if self.faults.get(verb):
             raise self.faults[verb].pop(0)
 
-    async def read(self, resource: ResourceType, namespace: str, name: str) -> dict[str, Any]:
+    async def read(
+        self, resource: ResourceType, namespace: str, name: str, *, only_metadata: bool = False
+    ) -> dict[str, Any]:
         self._called("get")
         assert (resource.plural, namespace, name) == ("fiberpools", "ns", "smoke-x")
         if self.pool is None:
-            raise Gone("not found")
+            raise NotFound("not found")
         if len(self.statuses) > 1:
             return {**self.pool, "status": self.statuses.pop(0)}
         return {**self.pool, "status": self.statuses[0]} if self.statuses else self.pool
@@ -157,10 +168,11 @@ def test_an_idle_operator_is_named() -> None:
     assert pools.pool is None
 
 
-def test_answers_that_are_lost_are_asked_for_again() -> None:
+@pytest.mark.parametrize("kind", [ServerUnreachable, Unauthorized, NotServed])
+def test_calls_whose_error_may_pass_are_repeated(kind: type[ApiError]) -> None:
     pools = Pools(READY)
-    lost = Unavailable("connection reset", what="get fiberpools")
-    pools.faults = {"get": [lost], "create": [lost], "delete": [lost]}
+    error = kind("no luck", what="get fiberpools")
+    pools.faults = {"get": [error], "create": [error], "delete": [error]}
     assert "its worker is ready" in run(pools)
     assert pools.pool is None
 
@@ -171,7 +183,7 @@ def test_a_create_that_was_carried_out_unseen_counts() -> None:
     async def create_unseen(*arguments: Any, **_: Any) -> dict[str, Any]:
         await Pools.create(pools, *arguments)
         pools.create = Pools.create.__get__(pools)  # type: ignore[method-assign]
-        raise Unavailable("no answer in time")
+        raise ServerUnreachable("no answer in time")
 
     pools.create = create_unseen  # type: ignore[method-assign]
     assert "its worker is ready" in run(pools)
@@ -180,7 +192,7 @@ def test_a_create_that_was_carried_out_unseen_counts() -> None:
 @pytest.mark.parametrize(
     ("error", "words"),
     [
-        (Gone("the server could not find the requested resource"), "crds.install=true"),
+        (NotFound("the server could not find the requested resource"), "crds.install=true"),
         (Invalid("spec.replicas: must not be negative"), "refuses the pool: spec.replicas"),
     ],
 )

@@ -6,8 +6,9 @@ import pytest
 
 from conformance.runner import Target
 from conformance.warm_pools import warm_pools
-from fiber._backends.kubernetes.api import POOLS, Api, NotFound
+from fiber._backends.kubernetes.api import Api
 from fiber._backends.kubernetes.attached_pool import PoolMaster
+from fiber_api.rest import POOLS, NotFound
 
 VARIABLES = Target("fiber", "spawn", frozenset({"core"}), 60).variables()
 

@@ -25,9 +25,10 @@ from typing import Any
 
 from fakes.cluster import FakeCluster, fake_cluster
 from fiber import config
-from fiber._backends.kubernetes.api import POOLS, Api, NotFound
+from fiber._backends.kubernetes.api import Api
 from fiber._backends.kubernetes.template import PodShape, fiber_pool_body, pod_template
 from fiber_api import names
+from fiber_api.rest import POOLS, NotFound
 from unit.kubernetes_rig import kubeconfig
 
 PODS = 4  # agents of each pool

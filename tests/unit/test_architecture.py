@@ -19,9 +19,8 @@ CLOCKS = {"monotonic", "perf_counter", "process_time", "thread_time", "time"}
 # Packages that only a part of Fiber needs; a program that only imports Fiber loads none of them.
 HEAVY = {"asyncio", "cloudpickle", "cryptography", "kubernetes", "numpy", "pydantic", "pynng"}
 
-# Classes of two modules that mean the same: errors of the API server for the SDK and for the
-# operator, and the error of executors, which is also a BrokenProcessPool.
-SAME_NAMES = {"ApiError", "Conflict", "Invalid", "WorkerDied"}
+# Classes of two modules that mean the same: the error of executors is also a BrokenProcessPool.
+SAME_NAMES = {"WorkerDied"}
 
 
 def python_files() -> list[Path]:

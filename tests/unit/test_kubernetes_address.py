@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 
 from fiber._backends.kubernetes import provisioner
-from fiber._backends.kubernetes.api import Forbidden
 from fiber._backends.kubernetes.provisioner import reachable_address, resolved
 from fiber.errors import ConfigError, FiberPoolError
+from fiber_api.rest import Forbidden
 
 
 class Cluster:

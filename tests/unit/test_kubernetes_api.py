@@ -19,12 +19,11 @@ from kubernetes.config import incluster_config
 from fakes.certificates import RUN_VALIDITY, Certificates, make_certificates
 from fakes.kubernetes_api import Fault
 from fakes.served import Served, served
-from fiber._backends.kubernetes.api import (
-    LEASES,
-    NODES,
+from fiber._backends.kubernetes.api import Api
+from fiber._backends.kubernetes.problems import explain
+from fiber.errors import ConfigError
+from fiber_api.rest import (
     PODS,
-    POOLS,
-    Api,
     ApiError,
     Conflict,
     Expired,
@@ -36,10 +35,7 @@ from fiber._backends.kubernetes.api import (
     TooManyRequests,
     Transient,
     Unauthorized,
-    error_of,
 )
-from fiber._backends.kubernetes.problems import explain
-from fiber.errors import ConfigError
 from patience import PATIENCE
 from unit.kubernetes_rig import NAMESPACE, kubeconfig
 
@@ -71,16 +67,6 @@ def api(
 ) -> Api:
     monkeypatch.setenv("KUBECONFIG", str(kubeconfig(tmp_path, server.api.url)))
     return connect()
-
-
-# -- Paths
-
-
-def test_paths_are_the_apis() -> None:
-    assert PODS.path("lab", "a") == "/api/v1/namespaces/lab/pods/a"
-    assert NODES.path() == "/api/v1/nodes"
-    assert POOLS.path("lab") == "/apis/fiber.dev/v1alpha1/namespaces/lab/fiberpools"
-    assert LEASES.path("l", "n") == "/apis/coordination.k8s.io/v1/namespaces/l/leases/n"
 
 
 # -- Logging in
@@ -413,13 +399,6 @@ def test_a_server_that_answers_is_reachable(
     assert api.trouble is None
 
 
-def test_a_watch_that_is_put_off_says_until_when() -> None:
-    status = {"code": 503, "message": "starting", "details": {"retryAfterSeconds": 7}}
-    error = error_of(503, {}, status)
-    assert isinstance(error, ServerError)
-    assert error.retry_after == 7
-
-
 def test_attempts_end_when_they_are_cancelled(server: Served, api: Api) -> None:
     server.api.faults.append(Fault(status=503, times=math.inf))
     cancel = threading.Event()
@@ -453,7 +432,7 @@ def test_a_watch_goes_on_from_a_version(server: Served, api: Api) -> None:
     watch = api.watch(ALL, {"labelSelector": "app=x"}, version)
     events = iter(watch)
     got = [next(events) for _ in range(2)]
-    assert [event["type"] for event in got] == ["ADDED", "DELETED"]
+    assert [kind for kind, _ in got] == ["ADDED", "DELETED"]
     watch.stop()
     assert list(events) == []
 
@@ -469,8 +448,8 @@ def _watch_and_stop(api: Api) -> None:
     seen = []
 
     def follow() -> None:
-        for event in watch:
-            seen.append(event["type"])
+        for kind, _ in watch:
+            seen.append(kind)
             first.set()
 
     thread = threading.Thread(target=follow)

@@ -7,11 +7,11 @@ from typing import Any
 import pytest
 
 from fiber._backends.kubernetes import backend
-from fiber._backends.kubernetes.api import Forbidden, NotFound, ServerUnreachable
 from fiber._runtime.state import _is_on_cluster
 from fiber.config import Config
 from fiber.errors import ConfigError
 from fiber_api import names
+from fiber_api.rest import Forbidden, NotFound, NotServed, ServerUnreachable
 
 ALLOWED = {"status": {"allowed": True}}
 LEASE = "/apis/coordination.k8s.io/v1/namespaces/{}/leases/operator.fiber.dev"
@@ -57,7 +57,9 @@ class Account:
                 if isinstance(answer, Exception):
                     raise answer
                 return answer
-        raise NotFound("404 page not found", status=404)
+        if "/namespaces/" in path:
+            raise NotFound("not found", status=404, reason="NotFound")
+        raise NotServed("404 page not found", status=404)
 
     def close(self) -> None:
         self.closed = True

@@ -18,8 +18,8 @@ from fakes.kubernetes_api import Call, Fault
 from fakes.rights import FiberUser
 from fakes.store import Failure
 from fiber._backends.kubernetes import fiber_pool, informer
-from fiber._backends.kubernetes.api import Forbidden
 from fiber_api import identity, names
+from fiber_api.rest import Forbidden
 from patience import PATIENCE
 from unit.kubernetes_rig import MASTER, NAMESPACE, OTHER, Body, Rig, Told
 from unit.kubernetes_rig import rig as make_rig

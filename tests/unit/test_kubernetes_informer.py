@@ -10,8 +10,8 @@ import pytest
 
 from fakes.kubernetes_api import Call, Fault
 from fiber._backends.kubernetes import informer
-from fiber._backends.kubernetes.api import PODS
 from fiber._backends.kubernetes.informer import Informer
+from fiber_api.rest import PODS
 from patience import PATIENCE
 from unit.kubernetes_rig import NAMESPACE, Rig
 from unit.kubernetes_rig import rig as make_rig

@@ -11,11 +11,11 @@ import pytest
 
 from fakes.kubernetes_api import Fault
 from fiber._backends.kubernetes import fiber_pool
-from fiber._backends.kubernetes.api import ApiError
 from fiber._backends.kubernetes.attached_pool import AttachedPool
 from fiber._backends.kubernetes.fiber_pool import LeaseRenewer
 from fiber.errors import FiberPoolError
 from fiber_api import names
+from fiber_api.rest import ApiError
 from patience import PATIENCE
 from unit.kubernetes_rig import MASTER, NAMESPACE, OTHER, Body, Rig, pool_body
 from unit.kubernetes_rig import rig as make_rig

@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from fiber._backends.kubernetes.api import Forbidden, ServerError, ServerUnreachable
 from fiber._backends.kubernetes.problems import PoolName, Reporter
 from fiber.errors import FiberPoolError
+from fiber_api.rest import Forbidden, ServerError, ServerUnreachable
 
 
 class Told:

@@ -7,7 +7,10 @@ from typing import Any
 
 import pytest
 
-from fiber._backends.kubernetes.api import (
+from fiber._backends.kubernetes.fiber_pool import PATCH_INTERVAL, REFUSED, Scaling
+from fiber.errors import FiberPoolError
+from fiber_api import names
+from fiber_api.rest import (
     ApiError,
     Conflict,
     Forbidden,
@@ -17,9 +20,6 @@ from fiber._backends.kubernetes.api import (
     TooManyRequests,
     Unauthorized,
 )
-from fiber._backends.kubernetes.fiber_pool import PATCH_INTERVAL, REFUSED, Scaling
-from fiber.errors import FiberPoolError
-from fiber_api import names
 
 
 class Pool:

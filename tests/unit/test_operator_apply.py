@@ -13,6 +13,7 @@ from fakes import virtual_time
 from fakes.kubernetes_api import Fault, KubernetesApi
 from fakes.store import Body, Store
 from fakes.world import configuration
+from fiber_api.rest import Conflict, TooManyRequests, Transient
 from fiber_operator import events
 from fiber_operator.cluster import Cluster, Permit
 from fiber_operator.creation import Created, Creation, CreationPace, Order, draw_suffix
@@ -20,7 +21,6 @@ from fiber_operator.events import EventRecorder
 from fiber_operator.operator_leases import NotLeader
 from fiber_operator.planning.plans import PoolEvent
 from fiber_operator.planning.pods import PodView, observe
-from fiber_operator.responses import Conflict, TooMany, Unavailable
 from fiber_operator.workqueue import Key
 
 ES = Key("team", "es")
@@ -121,7 +121,7 @@ async def test_names_whose_fate_is_unknown_are_used_first(
     api.faults += [Fault("create", "pods", carried_out=True), Fault("create", "pods")]
     pace = CreationPace(batch=2)
     done = await create(door, 4, pace)
-    assert isinstance(done.failure, Unavailable)
+    assert isinstance(done.failure, Transient)
     unsure = list(pace.unsure)
     assert len(unsure) == 2
     assert len(api.store.list("pods")) == 1
@@ -137,7 +137,7 @@ async def test_the_longest_wait_that_was_asked_for_counts(
 ) -> None:
     api.faults += [Fault("create", "pods", status=429, retry_after=n) for n in (3, 20, 5)]
     done = await create(door, 10, CreationPace(batch=4))
-    assert isinstance(done.failure, TooMany)
+    assert isinstance(done.failure, TooManyRequests)
     assert done.wait == 20.0
     assert len(done.names) == 1
 

@@ -18,10 +18,10 @@ from fakes import virtual_time
 from fakes.kubernetes_api import Fault
 from fakes.world import NAMESPACE, World, a_world, configuration
 from fiber_api import names
+from fiber_api.rest import ApiError
 from fiber_operator import watches
 from fiber_operator.cluster import Configuration, load_configuration
 from fiber_operator.process import OperatorProcess
-from fiber_operator.responses import ApiError
 from fiber_operator.settings import OperatorSettings
 from fiber_operator.watches import KopfThread
 from fiber_operator.workqueue import Key

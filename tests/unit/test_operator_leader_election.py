@@ -13,10 +13,10 @@ from fakes import virtual_time
 from fakes.kubernetes_api import Fault, KubernetesApi
 from fakes.store import Body, Store
 from fakes.world import configuration
+from fiber_api.rest import PODS, Transient
 from fiber_operator import operator_leases
-from fiber_operator.cluster import PODS, Cluster
+from fiber_operator.cluster import Cluster
 from fiber_operator.operator_leases import LeaderElector, NotLeader
-from fiber_operator.responses import Unavailable
 
 NAMESPACE, NAME, SECONDS = "fiber-system", "fiber-operator", 15
 
@@ -373,7 +373,7 @@ async def test_no_write_is_under_way_when_another_begins(found: Operators) -> No
             Fault("create", "pods", late=600, times=10**6),
         ]
         while first.is_leader:
-            with pytest.raises(Unavailable):
+            with pytest.raises(Transient):
                 await door.create(PODS, NAMESPACE, {"metadata": {"name": "x"}})
         last = now()
         assert not second.is_leader

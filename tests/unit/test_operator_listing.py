@@ -12,7 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fiber_operator.responses import PIECE, ListReader, Unavailable
+from fiber_api.rest import Transient
+from fiber_operator.responses import PIECE, ListReader
 
 Json = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(),
@@ -58,7 +59,7 @@ def test_the_last_page_of_a_list_has_no_continue_token() -> None:
 @given(OBJECTS, st.integers(min_value=0))
 def test_a_partial_list_raises_unavailable(items: Any, length: int) -> None:
     data = json.dumps(a_list(items)).encode()
-    with pytest.raises(Unavailable):
+    with pytest.raises(Transient):
         read(data[: length % len(data)])
 
 
@@ -79,7 +80,7 @@ def test_a_partial_list_raises_unavailable(items: Any, length: int) -> None:
     ids=str,
 )
 def test_an_answer_that_is_no_list_of_objects_is_refused(document: Any) -> None:
-    with pytest.raises(Unavailable):
+    with pytest.raises(Transient):
         read(json.dumps(document).encode())
 
 
@@ -88,7 +89,7 @@ def test_an_answer_that_is_no_list_of_objects_is_refused(document: Any) -> None:
     [b"", b"<html>", b"\xff", b"{}{}", b'{"items":[{}{}]}', b"{1:2}x", b"[" * 100_000],
 )
 def test_an_answer_that_is_no_document_is_refused(data: bytes) -> None:
-    with pytest.raises(Unavailable, match="list pods"):
+    with pytest.raises(Transient, match="list pods"):
         read(data)
 
 
@@ -123,5 +124,5 @@ def test_a_list_is_decoded_with_one_object_in_memory() -> None:
 
 
 def test_an_answer_that_goes_on_after_its_end_is_refused() -> None:
-    with pytest.raises(Unavailable):
+    with pytest.raises(Transient):
         read(json.dumps(a_list([{}])).encode() + b" {}")

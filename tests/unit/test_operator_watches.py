@@ -10,15 +10,15 @@ import pytest
 
 from fakes.kubernetes_api import Fault
 from fakes.world import World, a_world, configuration
+from fiber_api.rest import Forbidden, ServerUnreachable
 from fiber_operator.cluster import Configuration
 from fiber_operator.health import WatchStatus
 from fiber_operator.process import OperatorProcess
-from fiber_operator.responses import Refused, Unavailable
 from fiber_operator.settings import OperatorSettings
 from patience import PATIENCE
 
 SAID = 'pods is forbidden: User "operator" cannot watch resource "pods" at the cluster scope'
-REFUSED = Refused(SAID, what="watch pods", status=403, reason="Forbidden")
+REFUSED = Forbidden(SAID, what="watch pods", status=403, reason="Forbidden")
 
 
 def all_well(*namespaces: str) -> WatchStatus:
@@ -73,7 +73,7 @@ def test_a_missing_right_is_named_until_it_is_there(caplog: pytest.LogCaptureFix
 
 def test_other_failures_are_reported_too() -> None:
     watches = all_well()
-    watches.answered("list pods", Unavailable("too busy", what="list pods", status=500))
+    watches.answered("list pods", ServerUnreachable("too busy", what="list pods", status=500))
     assert watches.problems() == ["changes are not seen: list pods: too busy"]
 
 

@@ -8,12 +8,12 @@ from typing import Any
 
 from fiber_api import names
 from fiber_api.names import Reason
+from fiber_api.rest import ApiError, Forbidden, Invalid
 from fiber_api.times import format_time
 from fiber_api.v1alpha1 import Failures, FiberPool, MasterSpec
 from fiber_operator.planning.documents import items, mapping, text
 from fiber_operator.planning.plans import LeaseVerdict, Obstacle, PodRefusal
 from fiber_operator.planning.pods import PodView
-from fiber_operator.responses import ApiError, Invalid, Refused
 
 _SIGNALS = {4: "SIGILL", 6: "SIGABRT", 7: "SIGBUS", 8: "SIGFPE", 9: "SIGKILL", 11: "SIGSEGV"}
 _SIGNALS |= {1: "SIGHUP", 2: "SIGINT", 15: "SIGTERM"}
@@ -408,7 +408,7 @@ _SERVER = "The operator tries again by itself. If the problem stays, check the A
 
 def object_obstacle(error: ApiError, what: str) -> Obstacle:
     """Return the obstacle after an object could not be read or created; ``what`` names it."""
-    if isinstance(error, Refused):
+    if isinstance(error, Forbidden):
         return _forbidden(error, f"for {what}")
     if isinstance(error, Invalid):
         message = (
@@ -416,7 +416,9 @@ def object_obstacle(error: ApiError, what: str) -> Obstacle:
             "needs this object: change the policy or the webhook that refuses it."
         )
         return Obstacle(Reason.FORBIDDEN, message)
-    remedy = _WEBHOOKS.format(what=error.call.split()[-1]) if error.writes else _SERVER
+    # A call that changes an object passes admission webhooks.
+    writes = not error.call.startswith(("get ", "list ", "watch "))
+    remedy = _WEBHOOKS.format(what=error.call.split()[-1]) if writes else _SERVER
     message = (
         f"The call to {error.call} for {what} failed{quoted(error.message)}. Running workers go "
         f"on; no new ones are created meanwhile. {remedy}"
@@ -435,7 +437,7 @@ def creation_obstacle(error: ApiError) -> Obstacle:
 
 def deletion_obstacle(error: ApiError) -> Obstacle:
     """Return the obstacle after a failed deletion."""
-    if isinstance(error, Refused | Invalid):
+    if isinstance(error, Forbidden | Invalid):
         return _forbidden(error, "to delete objects that are not wanted")
     message = (
         f"The call to {error.call} failed{quoted(error.message)}. The unwanted object still "
@@ -447,7 +449,7 @@ def deletion_obstacle(error: ApiError) -> Obstacle:
 def list_obstacle(error: ApiError) -> Obstacle:
     """Return the obstacle after a failed list of pods."""
     blind = "Until then no worker is created or deleted, and the status shows the old numbers."
-    if isinstance(error, Refused | Invalid):
+    if isinstance(error, Forbidden | Invalid):
         return _forbidden(error, "to see the pool's workers", blind)
     message = f"The pool's workers cannot be listed{quoted(error.message)}. {blind} {_SERVER}"
     return Obstacle(Reason.API_UNAVAILABLE, message)
@@ -465,7 +467,7 @@ def unreadable_lease(pool: FiberPool, words: str) -> str:
 
 def unwritable_status(error: ApiError) -> str:
     """Return the message of an event that reports that the status cannot be written."""
-    remedy = _RIGHTS if isinstance(error, Refused) else _SCHEMA
+    remedy = _RIGHTS if isinstance(error, Forbidden) else _SCHEMA
     return (
         f"The status of this pool is out of date, because it cannot be written: {error}. Until it "
         f"can, no pod is created or deleted. {remedy}"

@@ -2,29 +2,14 @@
 
 ``ApiSession`` is the only importer of the package ``kubernetes``, and imports it at the first
 connection. The package does the logins: kubeconfigs with their plugins, accounts of pods, tokens
-that expire. ``Api`` adds the calls, and ``ApiResource`` the paths of the kinds of objects that a
-program uses.
-
-Errors::
-
-    ApiError
-    ├── Unauthorized  401  it does not know the login
-    ├── Forbidden     403  quota, policy, or no right
-    ├── NotFound      404  no such object, namespace or kind
-    ├── Conflict      409  the name is taken, or a precondition does not hold
-    ├── Expired       410  the version to watch from is forgotten
-    ├── Invalid       the rest of 4xx: repeating will not help
-    └── Transient          repeating may help
-        ├── Unreachable      no answer that could be trusted: no connection, too late, nonsense
-        ├── ServerError      5xx  it, or what it depends on, has failed
-        └── TooManyRequests  429  not now
+that expire. ``Api`` adds the calls and repeats those that may succeed later. Paths, errors and the
+meaning of each response are those of ``fiber_api.rest``.
 """
 
 from __future__ import annotations
 
 import contextlib
 import importlib.util
-import json
 import os
 import random
 import ssl
@@ -38,128 +23,19 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict, Unpack
 
 from fiber.errors import ConfigError
 from fiber_api import names
+from fiber_api.rest import (
+    Body,
+    Conflict,
+    ServerUnreachable,
+    Transient,
+    Unauthorized,
+    document_of,
+    event_of,
+)
 
 if TYPE_CHECKING:
     from kubernetes.client import ApiClient
     from urllib3 import BaseHTTPResponse
-
-
-Body = dict[str, Any]
-
-_LONGEST_RETRY_AFTER = 30.0
-"""Seconds.  A longer ``Retry-After`` counts as this."""
-
-_MESSAGE_LIMIT = 2000
-
-
-class ApiError(Exception):
-    """Error of a call.  ``reason`` is the API server's word for it; empty if there is none."""
-
-    def __init__(self, message: str, *, status: int = 0, reason: str = "") -> None:
-        super().__init__(message)
-        self.message = message
-        self.status = status
-        self.reason = reason
-
-
-class Unauthorized(ApiError):
-    """Error: the API server does not know the login."""
-
-
-class Forbidden(ApiError):
-    """Error: a quota, a policy or a missing right forbids the call."""
-
-
-class NotFound(ApiError):
-    """Error: no such object or namespace; without a ``reason``, no such kind of object."""
-
-
-class Conflict(ApiError):
-    """Error: the name is taken, or a precondition does not hold."""
-
-    repeated = False
-    """True if an earlier attempt of the same call had no answer, and may have succeeded."""
-
-
-class Expired(ApiError):
-    """Error: the server has forgotten the version to watch from.  List again."""
-
-
-class Invalid(ApiError):
-    """Error: the API server will never accept the call."""
-
-
-class Transient(ApiError):
-    """Error that may pass: repeat the call after ``retry_after`` seconds or later.
-
-    The call may have been carried out.
-    """
-
-    def __init__(self, message: str, *, retry_after: float = 0.0, **about: Any) -> None:
-        super().__init__(message, **about)
-        self.retry_after = retry_after
-
-
-class ServerUnreachable(Transient):
-    """Error: no answer came, or none of an API server."""
-
-
-class ServerError(Transient):
-    """Error: the API server, or a part that it depends on, has failed."""
-
-
-class TooManyRequests(Transient):
-    """Error: the API server is overloaded."""
-
-
-_KINDS: dict[int, type[ApiError]] = {
-    401: Unauthorized,
-    403: Forbidden,
-    404: NotFound,
-    408: ServerUnreachable,
-    409: Conflict,
-    410: Expired,
-    429: TooManyRequests,
-}
-
-
-def document_of(status: int, headers: Mapping[str, str], data: bytes) -> Body:
-    """Return the document in an answer; raise ``ApiError`` if the status is not a success."""
-    try:
-        body = json.loads(data)
-    except (ValueError, RecursionError):
-        body = None
-    if 200 <= status < 300:
-        if isinstance(body, dict):
-            return body
-        # Not in the message: it may be a part of a Secret.
-        raise ServerUnreachable(f"the answer is no JSON object ({len(data)} bytes)", status=status)
-    found = body if isinstance(body, dict) else {}
-    text = str(found.get("message") or "") or data[:200].decode(errors="replace").strip()
-    raise error_of(status, headers, found, text)
-
-
-def error_of(status: int, headers: Mapping[str, str], body: Body, text: str = "") -> ApiError:
-    """Return the error for a Status document, or for other text in its place."""
-    message = (str(body.get("message") or "") or text or f"HTTP status {status}")[:_MESSAGE_LIMIT]
-    kind = _kind_of(status)
-    about: dict[str, Any] = {"status": status, "reason": str(body.get("reason") or "")}
-    if issubclass(kind, Transient):
-        about["retry_after"] = _retry_after(headers, body)
-    return kind(message, **about)
-
-
-def _kind_of(status: int) -> type[ApiError]:
-    if status >= 500:
-        return ServerError
-    return _KINDS.get(status, Invalid) if status >= 400 else ServerUnreachable
-
-
-def _retry_after(headers: Mapping[str, str], body: Body) -> float:
-    """Return the header's value, or in a watch that of the Status document."""
-    text = headers.get("Retry-After") or str((body.get("details") or {}).get("retryAfterSeconds"))
-    return min(float(text), _LONGEST_RETRY_AFTER) if text.isdecimal() else 0.0
-
 
 READ_TIMEOUT = 30.0
 TIMEOUT = 30.0
@@ -299,7 +175,7 @@ class Api:
 
 
 class Watch:
-    """Events of one watch, ``{"type": …, "object": …}``, until it ends or ``stop``.
+    """Events of one watch, each a type and an object, until it ends or ``stop``.
 
     After the end, another watch can continue from the last version.
     """
@@ -311,7 +187,7 @@ class Watch:
         self._response: BaseHTTPResponse | None = None
         self._stopped = False
 
-    def __iter__(self) -> Iterator[Body]:
+    def __iter__(self) -> Iterator[tuple[str, Body]]:
         """Yield the events; ``ApiError``, Expired if the version is forgotten."""
         response = self._session.send(self._request, 2 * _WATCH_SECONDS)
         with self._lock:
@@ -321,7 +197,7 @@ class Watch:
             if response.status != 200:
                 _document(response)
             if not stopped:
-                yield from self._events(response)
+                yield from map(event_of, _lines(response))
         except ServerUnreachable:
             if not self._stopped:
                 raise
@@ -329,17 +205,6 @@ class Watch:
             with self._lock:
                 self._response = None
             response.close()
-
-    def _events(self, response: BaseHTTPResponse) -> Iterator[Body]:
-        for line in _lines(response):
-            try:
-                event = json.loads(line)
-                kind, found = event["type"], event["object"]
-            except (ValueError, RecursionError, KeyError, TypeError):
-                raise ServerUnreachable(f"an event of {len(line)} bytes is not JSON") from None
-            if kind == "ERROR":
-                raise error_of(int(found.get("code") or 500), {}, found)
-            yield {"type": kind, "object": found}
 
     def stop(self) -> None:
         """End the watch, also while it waits for an event.  Any thread."""
@@ -571,25 +436,3 @@ def _package() -> Any:
             "FIBER_BACKEND=local"
         ) from error
     return kubernetes
-
-
-class ApiResource(NamedTuple):
-    """Kind of object in the API."""
-
-    api_version: str
-    kind: str
-    plural: str
-
-    def path(self, namespace: str | None = None, name: str = "") -> str:
-        """Return the path of one object or, without a name, of the collection."""
-        group = "/apis" if "/" in self.api_version else "/api"
-        scope = f"namespaces/{namespace}" if namespace is not None else ""
-        return "/".join(filter(None, (group, self.api_version, scope, self.plural, name)))
-
-
-POOLS = ApiResource(names.API_VERSION, names.KIND, names.PLURAL)
-PODS = ApiResource("v1", "Pod", "pods")
-NODES = ApiResource("v1", "Node", "nodes")
-CLAIMS = ApiResource("v1", "PersistentVolumeClaim", "persistentvolumeclaims")
-SECRETS = ApiResource("v1", "Secret", "secrets")
-LEASES = ApiResource("coordination.k8s.io/v1", "Lease", "leases")

@@ -17,12 +17,17 @@ from dataclasses import dataclass
 from typing import Any
 
 from fiber import _logs
-from fiber._backends.kubernetes.api import (
+from fiber._backends.kubernetes.api import TIMEOUT, Api
+from fiber._exceptions import fresh
+from fiber._transport.credentials import MasterCredentials
+from fiber.errors import FiberPoolError
+from fiber_api import identity, names
+from fiber_api.identity import InvalidKey
+from fiber_api.names import ConditionType
+from fiber_api.rest import (
     LEASES,
     POOLS,
     SECRETS,
-    TIMEOUT,
-    Api,
     ApiError,
     Body,
     Conflict,
@@ -30,12 +35,6 @@ from fiber._backends.kubernetes.api import (
     NotFound,
     Transient,
 )
-from fiber._exceptions import fresh
-from fiber._transport.credentials import MasterCredentials
-from fiber.errors import FiberPoolError
-from fiber_api import identity, names
-from fiber_api.identity import InvalidKey
-from fiber_api.names import ConditionType
 from fiber_api.times import format_micro_time
 
 LOST = ("Deleted", "Replaced")

@@ -17,7 +17,7 @@ from typing import Any
 
 from fiber._agent.interface import ChildObserver, ChildSpec
 from fiber._backends.agent_set import AgentSet
-from fiber._backends.kubernetes.api import LEASES, Api, ApiError, Body, Forbidden, NotFound
+from fiber._backends.kubernetes.api import Api
 from fiber._backends.kubernetes.attached_pool import LOST
 from fiber._backends.kubernetes.fiber_pool import FiberPoolClient
 from fiber._backends.kubernetes.problems import AgentRoute, PoolName, node_of, pod_end
@@ -34,6 +34,7 @@ from fiber._transport.loop import Loop, LoopTimer
 from fiber.config import Config
 from fiber.errors import ConfigError, FiberError, FiberPoolError
 from fiber_api import names
+from fiber_api.rest import LEASES, ApiError, Body, Forbidden, NotFound, NotServed
 from fiber_api.times import format_time, parse_time
 
 
@@ -433,7 +434,7 @@ def _serves(api: Api, namespace: str) -> bool:
                 return True
             missing.append(f"{why} in the namespace {place!r}")
         api.get(f"/apis/{names.API_VERSION}", timeout=_TIMEOUT)
-    except NotFound:
+    except NotServed:
         return _on_this_machine("the cluster knows no FiberPools. Install the operator's chart")
     except ApiError as error:
         return _on_this_machine(

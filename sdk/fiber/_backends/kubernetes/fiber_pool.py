@@ -15,10 +15,17 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Protocol
 
-from fiber._backends.kubernetes.api import (
+from fiber._backends.kubernetes.api import Api
+from fiber._backends.kubernetes.attached_pool import AttachedPool
+from fiber._backends.kubernetes.informer import Informer
+from fiber._backends.kubernetes.problems import PoolName, Reporter
+from fiber._exceptions import fresh
+from fiber._transport.loop import Loop
+from fiber.errors import FiberPoolError
+from fiber_api import names
+from fiber_api.rest import (
     PODS,
     POOLS,
-    Api,
     ApiError,
     Body,
     Conflict,
@@ -27,13 +34,6 @@ from fiber._backends.kubernetes.api import (
     Transient,
     Unauthorized,
 )
-from fiber._backends.kubernetes.attached_pool import AttachedPool
-from fiber._backends.kubernetes.informer import Informer
-from fiber._backends.kubernetes.problems import PoolName, Reporter
-from fiber._exceptions import fresh
-from fiber._transport.loop import Loop
-from fiber.errors import FiberPoolError
-from fiber_api import names
 
 OPERATOR_SLOW, OPERATOR_ABSENT = 5.0, 30.0
 """Seconds without a status from the operator until a warning, and until an error."""

@@ -7,7 +7,8 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
 
-from fiber._backends.kubernetes.api import Api, ApiError, Body, Expired, Transient, Watch
+from fiber._backends.kubernetes.api import Api, Watch
+from fiber_api.rest import ApiError, Body, Expired, Transient
 
 _PAUSE_MIN, _PAUSE_MAX = 0.1, 5.0
 """Seconds until the next watch after one that ended early; growing."""
@@ -133,11 +134,10 @@ class Informer:
             if self._stopped.is_set():
                 return
             self._watch = watch
-        for event in watch:
-            found = event["object"]
-            if event["type"] != "BOOKMARK":
+        for kind, found in watch:
+            if kind != "BOOKMARK":
                 name = str(found["metadata"]["name"])
-                self._report(name, None if event["type"] == "DELETED" else found)
+                self._report(name, None if kind == "DELETED" else found)
             self._version = str(found["metadata"]["resourceVersion"])
 
     def _report(self, name: str, found: Body | None) -> None:

@@ -15,21 +15,22 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
-from fiber._backends.kubernetes.api import (
+from fiber._transport.loop import Loop
+from fiber.errors import FiberPoolError
+from fiber_api import names
+from fiber_api.names import ConditionType, Reason
+from fiber_api.rest import (
     ApiError,
     Forbidden,
     Invalid,
     NotFound,
+    NotServed,
     ServerError,
     ServerUnreachable,
     TooManyRequests,
     Transient,
     Unauthorized,
 )
-from fiber._transport.loop import Loop
-from fiber.errors import FiberPoolError
-from fiber_api import names
-from fiber_api.names import ConditionType, Reason
 from fiber_api.times import parse_time
 
 Status = Mapping[str, Any]
@@ -383,7 +384,7 @@ def _advice(error: ApiError, namespace: str, server: str) -> tuple[str, str]:
                 f"create rolebinding NAME -n {namespace} --clusterrole=fiber-user`, with --user= "
                 "or --serviceaccount=NAMESPACE:ACCOUNT"
             )
-        case NotFound(reason=""):
+        case NotServed():
             return "NotInstalled", (
                 f"The cluster at {server} knows no FiberPools: install the operator with its chart "
                 " (`helm install fiber-operator charts/fiber-operator -n fiber-system "

@@ -19,17 +19,7 @@ import threading
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any, NamedTuple, Protocol
 
-from fiber._backends.kubernetes.api import (
-    CLAIMS,
-    NODES,
-    PODS,
-    POOLS,
-    Api,
-    ApiError,
-    Body,
-    Forbidden,
-    NotFound,
-)
+from fiber._backends.kubernetes.api import Api
 from fiber._backends.kubernetes.attached_pool import OwnPool, PoolMaster, WarmPool, read_pool_key
 from fiber._backends.kubernetes.fiber_pool import AttachablePool
 from fiber._backends.kubernetes.problems import explain
@@ -51,6 +41,7 @@ from fiber._transport.loop import Loop
 from fiber.config import Config
 from fiber.errors import ConfigError, FiberPoolError
 from fiber_api import names
+from fiber_api.rest import CLAIMS, NODES, PODS, POOLS, ApiError, Body, Forbidden, NotFound
 
 _SUFFIX_BYTES = 4
 
