@@ -154,6 +154,19 @@ def test_without_retries_each_task_runs_at_most_once_and_gets_a_result(tmp_path:
     assert outcomes.count("died") <= 3
 
 
+def test_without_retries_no_task_of_a_batch_runs_twice(tmp_path: Path) -> None:
+    work = functools.partial(tasks.note_and_return, str(tmp_path))
+    with fiber.Pool(2, retries=0) as pool:
+        works(pool)
+        result = pool.map_async(work, range(1000))
+        wait_for(lambda: any(tmp_path.iterdir()))
+        for pid in pids(pool):
+            kill(pid)
+        assert outcome(result) == "died"
+    runs = Counter(path.name.split("-")[0] for path in tmp_path.iterdir())
+    assert max(runs.values()) == 1
+
+
 def outcome(result: Any) -> Any:
     try:
         return result.get(PATIENCE)
