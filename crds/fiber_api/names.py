@@ -232,9 +232,6 @@ def endpoint_of(address: str) -> str:
     return f"{ENDPOINT_SCHEME}://{address}"
 
 
-# -- Words of a status
-
-
 # -- Kubernetes' words for the ends of pods
 
 DISRUPTIONS: Final = {
@@ -257,8 +254,15 @@ LOST_CONTAINERS: Final = frozenset({"ContainerStatusUnknown", "Unknown"})
 a container is made up."""
 
 
+# -- Words of a status
+
+
 class ConditionType(StrEnum):
-    """Types of ``status.conditions``."""
+    """Types of ``status.conditions``.
+
+    A new condition needs a member here, a function in the operator's ``planning/status.py``, and a
+    row in docs/fiberpools.md (Read its status).
+    """
 
     ACCEPTED = "Accepted"
     """Condition: the operator understands the spec and the API server accepts its pods."""

@@ -38,7 +38,7 @@ _COLUMNS = (
 )
 
 _WIDE_COLUMNS = (("Message", "string", ".status.problems[0].message", "The worst problem"),)
-"""Priority of a column that only ``kubectl get -o wide`` shows."""
+"""Columns that only ``kubectl get -o wide`` shows; their priority is 1."""
 
 
 def definition() -> dict[str, Any]:

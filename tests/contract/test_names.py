@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from hypothesis import example, given, settings
@@ -118,3 +119,11 @@ def test_names_need_the_standard_library_alone() -> None:
         text=True,
     )
     assert (done.stdout, done.stderr) == ("\n", "")
+
+
+def test_the_documentation_explains_each_condition() -> None:
+    page = Path(__file__).parents[2].joinpath("docs", "fiberpools.md").read_text(encoding="utf-8")
+    rows = re.search(r"\| condition \| True means \|\n\|---\|---\|\n((?:\|.*\n)+)", page)
+    assert rows is not None
+    explained = [row.split("|")[1].strip() for row in rows[1].splitlines()]
+    assert explained == [str(kind) for kind in names.ConditionType]

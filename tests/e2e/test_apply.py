@@ -33,7 +33,7 @@ def table(pool: Pool) -> dict[str, str]:
     starts = [head.index(word) for word in head.split()]
     return {
         head[start:end].strip(): line[start:end].strip()
-        for start, end in pairwise([*starts, len(line) + 1])
+        for start, end in pairwise([*starts, max(len(head), len(line)) + 1])
     }
 
 

@@ -1,4 +1,4 @@
-"""Calls of a pool on each backend: results, order, signatures, input, extras."""
+"""Calls of a pool and their keywords, on the local and the loopback backend."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Options of a pool: every mistake is named, and no call hangs."""
+"""Options and arguments of a pool that are refused, on the local backend."""
 
 from __future__ import annotations
 

@@ -62,8 +62,8 @@ class Wire:
         self, worker: Worker, seq: int, payload: bytes, buffers: Sequence[memoryview]
     ) -> Work | Unknown | Broken | None:
         """Return the content of a packet."""
-        head = work.Head._make(work.HEAD.unpack_from(payload))
-        body = memoryview(payload)[work.HEAD.size :]
+        head = work.Head.unpack_from(payload)
+        body = memoryview(payload)[work.HEAD_FORMAT.size :]
         if head.kind == work.STOP:
             return None
         if head.kind == work.CALLS:

@@ -312,7 +312,7 @@ class Rig:
 
     def head(self, handle: WorkerHandle, index: int) -> work.Head:
         """The head of a message that a worker got."""
-        return work.Head._make(work.HEAD.unpack_from(self.child(handle).packets[index][1]))
+        return work.Head.unpack_from(self.child(handle).packets[index][1])
 
     def deliveries(self) -> Iterable[tuple[int, bytes]]:
         """All that all workers were sent."""

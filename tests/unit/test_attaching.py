@@ -125,7 +125,8 @@ def lend(
 
 @pytest.fixture
 def worker(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[BatchRunner, Results]]:
-    """Make a worker whose watchdog splits no batch, however slow the machine is."""
+    """Make a worker that splits no batch, however slow the machine is."""
+    monkeypatch.setattr("fiber._agent.worker.SPLIT_AFTER", PATIENCE)
     monkeypatch.setattr("fiber._agent.worker.Watchdog.begin", lambda self, batch: None)
     results = Results()
     worker = BatchRunner(results, memoryview(bytearray(24)).cast("Q"))

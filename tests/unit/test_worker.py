@@ -497,7 +497,7 @@ def test_a_short_batch_is_answered_once(rig: Rig) -> None:
 
 def test_a_function_and_calls_may_be_larger_than_4_gib() -> None:
     head = work.Head(work.MAP, 0, 1, 1, 5 << 30, 0)
-    assert work.Head._make(work.HEAD.unpack(work.HEAD.pack(*head))) == head
+    assert work.Head.unpack_from(head.pack()) == head
     assert work.CALL.unpack(work.CALL.pack(5 << 30, 3)) == (5 << 30, 3)
 
 

@@ -140,7 +140,7 @@ def _condition(pool: FiberPool) -> PoolCondition | None:
 OUTDATED = "cut-off"
 """Value in place of the template's hash of a pod that is cut off."""
 
-SKEW = 5.0
+API_SERVER_SKEW = 5.0
 """Seconds by which the clocks of two API servers may differ.  They date the Secret and the pods."""
 
 
@@ -161,7 +161,7 @@ def find_cut_off(pool: FiberPool, live: Sequence[PodView], knowledge: Knowledge)
     address = None if _names_its_own_address(pool) else knowledge.address
     return CutOff(
         [pod for pod in live if address and pod.address not in ("", address)],
-        [pod for pod in live if pod.created + SKEW < knowledge.credentials_made],
+        [pod for pod in live if pod.created + API_SERVER_SKEW < knowledge.credentials_made],
     )
 
 

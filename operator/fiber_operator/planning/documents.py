@@ -33,13 +33,13 @@ def whole(value: object, default: int = 0) -> int:
     return value if isinstance(value, int) and not isinstance(value, bool) else default
 
 
-SKEW = 60.0
+CLUSTER_SKEW = 60.0
 """Seconds by which the clocks of a cluster may differ."""
 
 
 def past(time: float | None, now: float) -> float | None:
-    """Return ``time``, or None if it is in the future: the operator did not write it then."""
-    return None if time is None or time > now + SKEW else time
+    """Return ``time``; None if it is over CLUSTER_SKEW ahead, as the operator did not write it."""
+    return None if time is None or time > now + CLUSTER_SKEW else time
 
 
 def seconds(value: object) -> float:

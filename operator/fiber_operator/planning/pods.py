@@ -69,7 +69,8 @@ class PodView:
     template_hash: str
     state: PodState
     since: float
-    """Time at which the pod came into this state, as far as the cluster says."""
+    """Time at which the pod came into this state, as far as the cluster says.  For TERMINATING: the
+    end of the grace period, which may be in the future."""
     was_ready: bool = False
     """True if the pod is or was Ready, as far as its conditions tell."""
     joining: bool = False

@@ -1,6 +1,8 @@
 """Status of a pool: its conditions, phase and counts, and the events of a plan.
 
-Equal input gives an equal status.  A status holds no time that changes by itself.
+Equal input gives an equal status.  The planner writes a time into the status when something
+happens, and keeps it until that happens again.  A field that depends on the present time needs a
+time at which the pool is planned again, among those of ``Plan.requeue_at``.
 """
 
 from __future__ import annotations
@@ -58,7 +60,7 @@ class PodCounts:
 
 @dataclass(frozen=True)
 class Outlook:
-    """State of the pool, and the work of the plan."""
+    """Input of the conditions: the pool's state, its problems, and the work of the plan."""
 
     counts: PodCounts
     problems: tuple[Problem, ...]
@@ -428,11 +430,13 @@ _BLIND: Mapping[ConditionType, Truth] = {
     ConditionType.READY: "Unknown",
     ConditionType.DEGRADED: "True",
 }
+"""Conditions that change while the operator cannot list the pods.  Others keep their values."""
 
 _UNREADABLE: Mapping[ConditionType, Truth] = {
     ConditionType.ACCEPTED: "False",
     ConditionType.DEGRADED: "True",
 }
+"""Conditions that change while the operator cannot read the spec.  Others keep their values."""
 
 
 # -- Events of a plan

@@ -109,7 +109,7 @@ class BatchRunner:
         started = time.perf_counter()
         payload = message.payload
         (seq,) = work.SEQ.unpack_from(payload)
-        head = work.Head._make(work.HEAD.unpack_from(payload, work.SEQ.size))
+        head = work.Head.unpack_from(payload, work.SEQ.size)
         try:
             if head.kind != work.STOP:
                 self._run_message(seq, head, payload[work.BODY :], message.buffers, started)
@@ -233,6 +233,7 @@ class BatchRunner:
     ) -> None:
         # Chunks that the user asked for stay whole.  The watchdog may split other batches.
         if batch.total > 1 and head.unit == 1:
+            # A first call starts the watchdog's thread, which inherits this thread's priority.
             self._watchdog.begin(batch)
         if head.stride > 1:
             apply = starmap if head.kind == work.STAR else map
@@ -287,6 +288,7 @@ class BatchRunner:
             slow = time.perf_counter() - started > SPLIT_AFTER
             if (slow and not len(values) % head.unit) or progress[2]:
                 batch.encode_new()
+                del item  # it may refer to an object of another host, which would be kept
                 batch.return_unstarted()
         batch.encode_new()
 

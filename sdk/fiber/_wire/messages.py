@@ -20,7 +20,8 @@ from fiber._wire.packet import ALIGNMENT, INLINE_LIMIT
 from fiber.errors import FiberError
 
 PROTOCOL = 2
-"""Version of all messages between master and agent; both must have the same."""
+"""Version of the frames of this module and of all that they carry: the messages of ``work.py`` and
+``hub.protocol``, and pickles of Fiber's classes.  Raise it when one of these changes."""
 
 DIGEST_BYTES = 32
 """Length of a blob's name, the SHA-256 of its bytes."""

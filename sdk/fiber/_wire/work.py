@@ -23,6 +23,8 @@ The worker gives the other tasks back.
 (position in values, VALUE | ERROR | AGAIN, pickle, number of buffers).  AGAIN is an error after
 which the pool runs the task again.  A large pickle is the first of its buffers, and None here.
 ``error`` is such a pickle.
+
+A change of this format raises ``messages.PROTOCOL``.
 """
 
 from __future__ import annotations
@@ -41,7 +43,6 @@ INIT_FAILED = "init failed"
 VALUE, ERROR, AGAIN = range(3)
 
 SEQ = struct.Struct("<Q")
-HEAD = struct.Struct("<BHIQQI")
 CALL = struct.Struct("<QI")
 
 NUMBERS = frozenset({int, float, complex, bool, type(None)})
@@ -56,28 +57,41 @@ class Head(NamedTuple):
     """Fixed part of a message to a worker."""
 
     kind: int
-    stride: int
+    stride: int = 0
     """Tasks between two notes of the worker's progress.  0: the worker prepares each result as soon
     as it has it."""
-    unit: int
+    unit: int = 1
     """Number of tasks that stay together."""
-    function: int
-    size: int
+    function: int = 0
+    size: int = 0
     """Bytes of the pickled function, 0 if the worker has it; for CALLS the number of calls."""
-    buffers: int
+    buffers: int = 0
     """Number of the message's buffers that belong to the function."""
 
+    def pack(self) -> bytes:
+        """Return the bytes of this head."""
+        return HEAD_FORMAT.pack(*self)
+
+    @classmethod
+    def unpack_from(cls, message: BytesLike, offset: int = 0) -> Head:
+        """Return the head that begins at ``offset`` of ``message``."""
+        return cls._make(HEAD_FORMAT.unpack_from(message, offset))
+
+
+HEAD_FORMAT = struct.Struct("<BHIQQI")
+"""Format of the fields of ``Head``, in their order."""
 
 BESIDE = (1 << 64) - 1
 """Value in place of the size of a pickle.  The pickle is then the first of its buffers."""
 
-BODY = SEQ.size + HEAD.size
+BODY = SEQ.size + HEAD_FORMAT.size
 """Offset of the part after the head."""
 
 BUFFERS = 256
 """Limit of large buffers.  An object with more is pickled as a whole."""
 
-STOP_MESSAGE = HEAD.pack(STOP, 0, 1, 0, 0, 0)
+STOP_MESSAGE = Head(STOP).pack()
+_ONE_CALL = Head(CALLS, size=1).pack()
 
 
 Pickle = tuple[bytes, Sequence[memoryview]]
@@ -103,10 +117,10 @@ def pack_calls(calls: Sequence[Pickle]) -> bytes:
     """Return a message of pickled calls that went through ``move_beside``."""
     if len(calls) == 1:
         data, buffers = calls[0]
-        return HEAD.pack(CALLS, 0, 1, 0, 1, 0) + _entry(data, buffers) + data
+        return _ONE_CALL + _entry(data, buffers) + data
     table = b"".join([_entry(data, buffers) for data, buffers in calls])
     body = b"".join([data for data, _ in calls])
-    return HEAD.pack(CALLS, 0, 1, 0, len(calls), 0) + table + body
+    return Head(CALLS, size=len(calls)).pack() + table + body
 
 
 def _entry(data: bytes, buffers: Sequence[memoryview]) -> bytes:
@@ -129,7 +143,7 @@ def unpack_calls(body: memoryview, count: int) -> Iterable[tuple[memoryview | No
 
 def pack_batch(head: Head, function: bytes, items: BytesLike) -> bytes:
     """Return a message of one function and the items to apply it to."""
-    return b"".join((HEAD.pack(*head), function, items))
+    return b"".join((head.pack(), function, items))
 
 
 def is_plain(items: Sequence[Any]) -> bool:
