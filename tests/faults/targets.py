@@ -361,3 +361,8 @@ def put_bulky_items(queue: Any, count: int, there: Any) -> None:
 
 def send_checksum(connection: Any, data: bytes) -> None:
     connection.send(checksum(data))
+
+
+def acquire_each(*locks: Any) -> None:
+    for lock in locks:
+        lock.acquire()

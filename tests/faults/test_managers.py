@@ -185,6 +185,21 @@ def test_a_lock_of_a_dead_process_is_released(manager: Any, victim: Any, kind: s
     assert lock.acquire(True, PATIENCE) is True, "it is said once"
 
 
+@pytest.mark.filterwarnings("ignore:.*ended while it held:RuntimeWarning")
+def test_another_process_releases_the_lock_of_a_process_that_ended_or_waits_for_it(
+    manager: Any,
+) -> None:
+    released, waited_for = manager.Lock(), manager.Lock()
+    holder = fiber.Process(target=targets.acquire_each, args=(released, waited_for))
+    holder.start()
+    holder.join(PATIENCE)
+    assert holder.exitcode == 0
+    holder.close()
+    released.release()
+    assert released.acquire(False)
+    assert waited_for.acquire(timeout=PATIENCE)
+
+
 @pytest.mark.parametrize("kind", ["Lock", "RLock"])
 def test_a_dead_waiter_gets_no_lock(manager: Any, victim: Any, kind: str) -> None:
     lock, begun = getattr(manager, kind)(), manager.Event()

@@ -430,6 +430,12 @@ class ClientHandler:
             self._holder = None
             request.answer(Status.OK)
 
+    def disown(self, message: Message) -> None:
+        """Leave the stream's token taken: its process ends without releasing it."""
+        if self._holder is not None:
+            self._semaphore().disown()
+            self._holder = None
+
     def tokens(self, message: Message) -> None:
         """Reply with the number of tokens."""
         self._request(message).answer(Status.OK, self._semaphore().value())

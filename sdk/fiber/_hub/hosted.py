@@ -310,6 +310,10 @@ class HostedSemaphore:
         else:
             self._loop.call_later(_RELEASE_AGAIN, self.release)
 
+    def disown(self) -> None:
+        """Leave a token taken.  A waiter gets it back, or another process releases it."""
+        self._semaphore.disown()
+
     def abandon(self, holder: str) -> None:
         """Note the dead holder for the next acquirer, warn, and return its token."""
         self._semaphore.note_death(holder)

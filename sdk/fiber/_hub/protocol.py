@@ -21,7 +21,7 @@ from collections.abc import Callable
 from enum import IntEnum, IntFlag
 from typing import NamedTuple
 
-VERSION = 4
+VERSION = 5
 KEY_BYTES = 32
 
 SECRET_BYTES = 16
@@ -110,6 +110,7 @@ class Op(IntEnum):
     ACQUIRE = 40  # name of the process beside it -> 1 if the stream keeps it; dead holder beside it
     POST = 41  # NO if the semaphore is at its maximum
     TOKENS = 42  # -> number of tokens
+    DISOWN = 43  # the stream no longer keeps its token, which stays taken; silent
     # For an attached wait list
     ENTER = 50
     SLEEP = 51

@@ -151,6 +151,17 @@ class RemoteSemaphore(RemoteObject):
         finally:
             self._idle.append(stream)
 
+    def disown(self) -> None:
+        """Leave the tokens of this process taken when it ends, for another process to release.
+
+        A process of the semaphore's host that ends does the same.
+        """
+        while self._holding:
+            stream = self._holding.pop()
+            with suppress(OSError, ObjectUnreachable):
+                stream.say(Op.DISOWN)
+            self._idle.append(stream)
+
     def _is_mine(self) -> bool:
         """Tell whether this thread holds it, and was the last of this process to acquire it."""
         return self._depth > 0 and self._owner == threading.get_ident()

@@ -57,6 +57,9 @@ _LOOK_AGAIN = 0.5
 _FILES_AGAIN = 0.05
 """Seconds between attempts to receive a channel when this process may open no more files."""
 
+_BEFORE_EXIT = -50
+"""Exit priority: after the managers of this process have been shut down."""
+
 
 class ManagerAddress(NamedTuple):
     """Value of ``manager.address`` where none was chosen.  Any process of the program may use it.
@@ -192,6 +195,7 @@ class ManagerSession:
         self._references[ident] += 1
         if lock is not None:
             self._locks[ident] = lock
+            _disown_at_exit()
         _referenced[self.address] = self
 
     def drop_reference(self, ident: str) -> None:
@@ -199,10 +203,16 @@ class ManagerSession:
         self.notify(DECREF, ident)
         self._references[ident] -= 1
         if self._references[ident] <= 0:
-            self._locks.pop(ident, None)
             del self._references[ident]
+            if lock := self._locks.pop(ident, None):
+                primitives.disown(lock)
         if not self._references:
             _referenced.pop(self.address, None)
+
+    def disown_locks(self) -> None:
+        """Let other processes release what this process has acquired: it ends."""
+        for lock in list(self._locks.values()):
+            primitives.disown(lock)
 
     def notify(self, *notice: str) -> None:
         """Send the server a notice, without waiting even for room."""
@@ -425,6 +435,21 @@ def thread_name() -> str:
     """Return the name of this thread, for the threads of the server."""
     name = current_process().name
     return name if current_thread() is main_thread() else f"{name}|{current_thread().name}"
+
+
+_disowns_in = 0
+
+
+def _disown_at_exit() -> None:
+    global _disowns_in
+    if _disowns_in != os.getpid():
+        _disowns_in = os.getpid()
+        util.Finalize(None, _disown_all, exitpriority=_BEFORE_EXIT)
+
+
+def _disown_all() -> None:
+    for one in list(_sessions.values()):
+        one.disown_locks()
 
 
 def _after_fork() -> None:

@@ -13,6 +13,7 @@ from multiprocessing import managers as mp_managers
 from multiprocessing.managers import BaseProxy
 from typing import Any
 
+from fiber._hub.shared_blocks import RemoteSemaphore
 from fiber.synchronize import BoundedSemaphore, Condition, Lock, RLock, Semaphore, SemLock
 
 _AcquirerProxy: Any = mp_managers.AcquirerProxy  # type: ignore[attr-defined]  # typeshed lacks it
@@ -47,6 +48,13 @@ _OURS: dict[Any, Callable[..., Any]] = {
     threading.BoundedSemaphore: BoundedSemaphore,
     threading.Condition: _condition,
 }
+
+
+def disown(lock: SemLock | Condition) -> None:
+    """Let another process release the lock, which this process does not use any longer."""
+    semaphore = (lock._lock if isinstance(lock, Condition) else lock)._semlock
+    if isinstance(semaphore, RemoteSemaphore):
+        semaphore.disown()
 
 
 def call(lock: Any, method: str, args: Any, kwds: Any) -> Any:

@@ -268,6 +268,10 @@ class SharedSemaphore:
             self._idle += (slot,)
         return self._try_acquire()
 
+    def disown(self) -> None:
+        """Leave a token of this process taken, as if the process had ended."""
+        self._words[self._held.pop()] = _LEFT
+
     def note_death(self, holder: str) -> None:
         """Note for the next acquirer that the process ``holder`` ended with a token."""
         start, size = 8 * _DEAD.start, 8 * len(_DEAD)
