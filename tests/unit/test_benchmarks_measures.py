@@ -140,7 +140,7 @@ def test_a_measure_runs_in_process(measure: Any, contender: str, case: Case) -> 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("measure", kubernetes_report.MEASURES.keys() - MEASURES.keys())
+@pytest.mark.parametrize("measure", sorted(kubernetes_report.MEASURES.keys() - MEASURES.keys()))
 def test_a_measure_of_pods_runs_without_them(measure: str) -> None:
     module = kubernetes_report.MEASURES[measure]
     for case in module.cases(0.02)[:2]:
