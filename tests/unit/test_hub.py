@@ -93,6 +93,17 @@ def test_an_empty_collection_releases_no_grants(hosts: Hosts) -> None:
     assert not collected
 
 
+def test_a_pickling_that_was_interrupted_before_its_block_is_forgotten(hosts: Hosts) -> None:
+    handles.Pickling(reusable=True).__enter__()
+    with hosts.at("a") as hub:
+        one, other = fiber.Pipe()
+        data = pickle.dumps(other)
+        other.close()
+        pickle.loads(data).close()
+        assert objects_kept(hub) == 0, "the handle worked once"
+        one.close()
+
+
 def test_a_pickling_that_failed_leaves_no_grant(hosts: Hosts) -> None:
     with hosts.at("a") as hub:
         one, other = fiber.Pipe()

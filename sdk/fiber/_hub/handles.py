@@ -16,6 +16,7 @@ import contextlib
 import copyreg
 import os
 import threading
+import weakref
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from multiprocessing import context as mp_context
@@ -377,7 +378,7 @@ class Pickling:
     ``grants`` are released.  A signal's handler may pickle in the middle of another pickling.
     """
 
-    __slots__ = ("_outer", "grants", "reusable", "undo")
+    __slots__ = ("__weakref__", "_outer", "grants", "reusable", "undo")
 
     def __init__(self, *, reusable: bool = False) -> None:
         self.reusable = reusable
@@ -385,7 +386,9 @@ class Pickling:
         self.undo: list[Callable[[], None]] = []
 
     def __enter__(self) -> Self:
-        self._outer, _this_thread.pickling = _this_thread.pickling, self
+        # An interrupt may strike before the block begins, and then no call of __exit__ follows.
+        # Without the weak reference, this would stay the thread's pickling for ever.
+        self._outer, _this_thread.pickling = _this_thread.pickling, weakref.ref(self)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
@@ -417,28 +420,35 @@ def ring_doorbell() -> None:
 
 
 class _ThisThread(threading.local):
-    pickling: Pickling | None = None
+    pickling: weakref.ref[Pickling] | None = None
 
 
 _this_thread = _ThisThread()
 _single_use = _SingleUse()
 
 
+def _current() -> Pickling | None:
+    reference = _this_thread.pickling
+    return None if reference is None else reference()
+
+
 def undo_pickling() -> None:
     """End the grants of the current pickling, which begins again in another way."""
-    if _this_thread.pickling is not None:
-        _this_thread.pickling.take_back()
+    pickling = _current()
+    if pickling is not None:
+        pickling.take_back()
 
 
 def _undo_by(step: Callable[[], None]) -> None:
     """Note how to end a grant if the current pickling fails."""
-    if _this_thread.pickling is not None:
-        _this_thread.pickling.undo.append(step)
+    pickling = _current()
+    if pickling is not None:
+        pickling.undo.append(step)
 
 
 def _grants() -> GrantSet | _SingleUse:
     """Return the source of grants for the handle that is being pickled."""
-    pickling = _this_thread.pickling
+    pickling = _current()
     if pickling is None:
         return _single_use
     if pickling.reusable and pickling.grants is None:
