@@ -52,13 +52,14 @@ test-programs:
 # latter's output is shown at the end. The shell starts background jobs with Ctrl-C ignored, which
 # tests of signals would inherit; env resets it.
 test-side-by-side:
-	@mkdir -p build; failed=; \
-	setsid env --default-signal=INT,QUIT $(MAKE) --no-print-directory --keep-going \
-		test-conformance test-programs >build/test-beside.log 2>&1 & \
-	beside=$$!; trap 'kill -s INT -- -$$beside; wait; exit 130' INT TERM; \
+	@mkdir -p build; rm -f build/test-beside.failed; \
+	setsid env --default-signal=INT,QUIT sh -c 'for part in test-conformance test-programs; do \
+		$(MAKE) --no-print-directory $$part || echo " $$part" >>build/test-beside.failed; done' \
+		>build/test-beside.log 2>&1 & \
+	beside=$$!; trap 'kill -s INT -- -$$beside; wait; exit 130' INT TERM; failed=; \
 	$(MAKE) --no-print-directory test-on-cluster || failed=" test-on-cluster"; \
-	wait $$beside || failed="$$failed test-conformance or test-programs"; \
-	cat build/test-beside.log; \
+	wait $$beside || failed="$$failed test-beside"; cat build/test-beside.log; \
+	[ ! -e build/test-beside.failed ] || failed="$$failed$$(tr -d '\n' <build/test-beside.failed)"; \
 	[ -z "$$failed" ] || { echo "test-side-by-side: failed:$$failed" >&2; exit 1; }
 
 test-conformance:
