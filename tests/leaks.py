@@ -75,8 +75,19 @@ class Watch:
             processes=frozenset(found.pid for found in started),
             threads=frozenset(threading.enumerate()),
             descriptors=frozenset(_descriptors()),
-            files=frozenset(os.listdir(self._folder)),
+            files=frozenset(name for name in os.listdir(self._folder) if not self._probe(name)),
         )
+
+    def _probe(self, name: str) -> bool:
+        """Tell whether the file is Python's own, of a process that was killed as it made it.
+
+        ``tempfile`` writes ``blat`` to a file with a random name of eight characters, and removes
+        it, to find out whether the folder can be written to.
+        """
+        try:
+            return len(name) == 8 and (self._folder / name).read_bytes() in (b"", b"blat")
+        except OSError:  # a folder, or a file that is gone
+            return False
 
     def left_since(self, before: Snapshot, *, excuse_runtime: bool = True) -> list[str]:
         """Return the leftovers in words, once all that is ending has ended."""

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NoReturn
 
+from fiber import util
 from patience import PATIENCE
 
 
@@ -231,6 +232,11 @@ def vanish(path: Path) -> NoReturn:
 def killed_until(path: Path, times: int) -> None:
     if count(path) <= times:
         os.kill(os.getpid(), signal.SIGKILL)
+
+
+def end_slowly(gate: Path) -> None:
+    """Let this worker end only once ``gate`` exists, unless it is killed."""
+    util.Finalize(None, wait_for, (gate,), exitpriority=1)
 
 
 def start_slowly(gate: Path) -> None:

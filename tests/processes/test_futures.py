@@ -388,6 +388,19 @@ def test_workers_come_with_the_work_and_are_replaced() -> None:
         assert executor.submit(tasks.square, 2).result(PATIENCE) == 4
 
 
+def test_a_replaced_worker_that_has_not_ended_is_not_counted(tmp_path: Path) -> None:
+    gate = tmp_path / "gate"
+    with fiber.Executor(
+        1, max_tasks_per_child=1, initializer=tasks.end_slowly, initargs=(gate,)
+    ) as executor:
+        first = executor.submit(tasks.pid).result(PATIENCE)
+        second = executor.submit(tasks.pid).result(PATIENCE)
+        counted = set(executor._processes)
+        gate.touch()
+        assert first != second
+        assert first not in counted
+
+
 @pytest.mark.parametrize(
     ("options", "error", "says"),
     [

@@ -102,3 +102,12 @@ def test_a_temporary_file_is_found(watch: leaks.Watch, tmp_path: Path) -> None:
     tempfile.mkdtemp(prefix="fiber-", dir=tmp_path)
     (line,) = watch.left_since(before)
     assert line.startswith("temporary file fiber-")
+
+
+def test_the_file_with_which_python_tries_a_folder_is_not_a_leak(
+    watch: leaks.Watch, tmp_path: Path
+) -> None:
+    before = watch.look()
+    (tmp_path / "6y_b1rzl").write_bytes(b"blat")
+    (tmp_path / "7y_b1rzl").write_bytes(b"data")
+    assert watch.left_since(before) == ["temporary file 7y_b1rzl"]

@@ -81,8 +81,9 @@ class ExecutorGroup:
         return list(self._executors.values())
 
     def processes(self) -> list[BaseProcess]:
-        """Return the processes of all workers."""
-        return [process for each in self.executors() for process in each.workers.processes()]
+        """Return the processes of all workers but those that were asked to end."""
+        views = [each.workers for each in self.executors()]
+        return [process for view in views for process in view.processes(leaving=False)]
 
     def shut_down(self, wait: bool, cancel: bool) -> None:
         """Take no more tasks; ``cancel`` those that have not begun, ``wait`` for the rest."""

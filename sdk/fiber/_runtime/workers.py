@@ -384,10 +384,17 @@ class WorkerView:
         """Latches of the waiting threads.  Each thread adds and removes one."""
         self._over = False
 
-    def processes(self) -> list[BaseProcess]:
-        """Return the Process objects of the workers that have one."""
+    def processes(self, *, leaving: bool = True) -> list[BaseProcess]:
+        """Return the Process objects of the workers that have one.
+
+        ``leaving``: also those of workers that were asked to end.
+        """
         handles: list[Any] = list(self._workers.members)
-        return [handle.process for handle in handles if handle.process is not None]
+        return [
+            handle.process
+            for handle in handles
+            if handle.process is not None and (leaving or not handle.leaving)
+        ]
 
     def describe(self) -> list[WorkerInfo]:
         """Return the states of all workers, the oldest first."""
