@@ -1,7 +1,8 @@
 """Key of a pool, and the key of each agent that is derived from it. Standard library only.
 
-An agent proves by its own key that it is the pod of that name and uid. The pool's key gives the
-keys of all its agents, so only the operator, the master and a pod's first init container see it.
+An agent proves by its own key that it is the pod of that name and uid. In a pool with one master,
+the pool's key gives the keys of all its agents, and the master knows it. In a warm pool, where
+masters follow one another, no master knows it: see ``fiber_api.signatures``.
 """
 
 from __future__ import annotations

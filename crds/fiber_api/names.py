@@ -124,7 +124,7 @@ ENDPOINT_SCHEME: Final = "tls+tcp"
 # -- The Secret: its keys
 
 KEY_POOL: Final = "key"
-"""Entry with 256 random bits in hexadecimal digits, from which each agent's key is derived."""
+"""Entry with 256 random bits in hexadecimal digits: the pool's key."""
 KEY_MASTER: Final = "master"
 """Entry with the SHA-256 of the certificate of the only master that the pool ever has; absent if
 one master may follow another."""

@@ -115,6 +115,11 @@ class FiberPoolStatus(Model):
     """Address of the master that the endpoint leads to now."""
     master_epoch: Annotated[int | None, Field(ge=0, le=2**53)] = None
     """Highest epoch that a master of this pool has had. A new master takes a higher one."""
+    master_signature: str | None = None
+    """Signature of the pool for spec.master.certificate and masterEpoch, in hexadecimal digits."""
+    public_key: str | None = None
+    """Public key of the pool, which agents and masters check signatures with. Absent if the Secret
+    names the only master of the pool."""
     idle_since: Time | None = None
     """Time since which the master has asked for no workers, if spec.idle is set."""
     credentials_secret: str | None = None

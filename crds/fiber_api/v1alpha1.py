@@ -103,10 +103,11 @@ class MasterSpec(Model):
         Rule(
             "epoch",
             "self.epoch > oldSelf.epoch || (self.host == oldSelf.host && self.port == oldSelf.port"
-            f" && self.identity == oldSelf.identity && {_unchanged('leaseName')})",
-            "must rise where host, port, identity or leaseName change: that is another master, "
-            "and one that is there would be replaced unseen. Take an epoch above the one that "
-            "is there.",
+            f" && self.identity == oldSelf.identity && {_unchanged('leaseName')}"
+            f" && {_unchanged('certificate')})",
+            "must rise where host, port, identity, leaseName or certificate change: that is "
+            "another master, and one that is there would be replaced unseen. Take an epoch above "
+            "the one that is there.",
             None,
         ),
     )
@@ -119,6 +120,11 @@ class MasterSpec(Model):
     """Number of this master: higher with every new one, and never lower than before."""
     identity: Annotated[str, Field(min_length=1, max_length=253)]
     """Name of the pool's holder, for people and for the next program, such as laptop-7:4711."""
+    certificate: Annotated[
+        str | None, Field(min_length=64, max_length=64, pattern="^[0-9a-f]{64}$")
+    ] = None
+    """SHA-256 of the certificate that the master shows its agents. The operator signs it, and the
+    agents of a warm pool serve no master without that signature."""
     lease_name: ObjectName | None = None
     """Name of the Lease in this namespace that the master renews. Left out, the master counts as
     alive without a check."""

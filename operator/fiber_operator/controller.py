@@ -520,7 +520,7 @@ class Controller:
         knowledge = Knowledge(
             address=state.address,
             credentials=dependents.credentials if dependents else None,
-            credentials_made=dependents.credentials_made if dependents else 0.0,
+            secret=dependents.secret if dependents else None,
             obstacles=dependents.obstacles if dependents else (),
             led=dependents is None or dependents.master == pool.spec.master,
             creation=state.creation,

@@ -3,7 +3,7 @@
 They are checked when the operator first sees a pool, every ``CHECK_INTERVAL`` seconds, and in each
 reconcile while something is wrong with them.  Between the checks only a new master causes a call.
 A Secret that ``spec.credentialsSecretName`` names belongs to the user; the operator only makes
-sure that it is not another pool's.
+sure that it is not another pool's, and signs with its key.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from fiber_api import identity, names
+from fiber_api import identity, names, signatures
 from fiber_api.names import Reason
 from fiber_api.rest import (
     BUDGETS,
@@ -33,7 +33,7 @@ from fiber_api.v1alpha1 import FiberPool, MasterSpec
 from fiber_operator.cluster import MAY_PASS, Cluster
 from fiber_operator.planning import manifests, messages
 from fiber_operator.planning.documents import items, mapping, seconds, text
-from fiber_operator.planning.plans import Obstacle
+from fiber_operator.planning.plans import Obstacle, PoolSecret
 
 CHECK_INTERVAL = 50.0
 
@@ -51,8 +51,8 @@ class Dependents:
     """Time of the last complete check."""
     credentials: bool
     """True if the Secret belongs to the pool and has a valid key, or is the user's."""
-    credentials_made: float = 0.0
-    """Creation time of the Secret; 0.0 if it is not known."""
+    secret: PoolSecret | None = None
+    """The pool's Secret; None while there is none."""
     budget: int | None = None
     """Value of the PodDisruptionBudget.  None: there is none.  0: not known."""
     failure: ApiError | None = None
@@ -63,13 +63,13 @@ class Dependents:
 class _Found:
     """Outcome of one step."""
 
-    value: str | None = None
-    """Address of the Service, or creation time of the Secret."""
+    value: str | PoolSecret | None = None
+    """Address of the Service, or the Secret."""
     obstacle: Obstacle | None = None
     failure: ApiError | None = None
 
 
-_Step = Callable[[FiberPool], Awaitable[str | None]]
+_Step = Callable[[FiberPool], Awaitable[str | PoolSecret | None]]
 
 
 class _Obstructed(Exception):
@@ -127,14 +127,14 @@ class DependentsReconciler:
             (f"the EndpointSlice {names.endpoint_slice_name(name)}", self._slice)
         ]
         fresh = known is not None and self._now() - known.checked < CHECK_INTERVAL
-        complete = known is None or not fresh or bool(known.obstacles)
+        complete = known is None or not fresh or bool(known.obstacles) or known.secret is None
         if known is not None and not complete:
             if (known.master, known.budget) == (pool.spec.master, pool.spec.min_available):
                 return known
-            address, made, checked = known.address, known.credentials_made, known.checked
+            address, secret, checked = known.address, known.secret, known.checked
             whole = known.credentials
         else:
-            address, made, checked = None, 0.0, self._now()
+            address, secret, checked = None, None, self._now()
             whole = False
             steps += [
                 (f"the Service {names.service_name(name)}", self._service),
@@ -145,7 +145,9 @@ class DependentsReconciler:
             steps.append((f"the PodDisruptionBudget {names.budget_name(name)}", self._budget))
         found = await _all(*(self._attempt(pool, *step) for step in steps))
         if complete:
-            address, made = found[1].value, seconds(found[2].value)
+            service, made = found[1].value, found[2].value
+            address = service if isinstance(service, str) else None
+            secret = made if isinstance(made, PoolSecret) else None
             whole = found[2].obstacle is None
         led = found[0].obstacle is None
         before = known.master if known is not None else None
@@ -155,7 +157,7 @@ class DependentsReconciler:
             pool.spec.master if led else before,
             checked,
             whole,
-            made,
+            secret,
             0 if budgeted and found[-1].obstacle is not None else pool.spec.min_available,
             next((step.failure for step in found if step.failure is not None), None),
         )
@@ -171,28 +173,27 @@ class DependentsReconciler:
             obstacle = messages.object_obstacle(error, what)
             return _Found(None, obstacle, error if isinstance(error, MAY_PASS) else None)
 
-    async def _secret(self, pool: FiberPool) -> str | None:
+    async def _secret(self, pool: FiberPool) -> PoolSecret | None:
         if (brought := pool.spec.credentials_secret_name) is not None:
-            await self._check_brought(pool, brought)
-            return None
+            return await self._check_brought(pool, brought)
         name = names.secret_name(pool.metadata.name)
 
         def new() -> Body:
             return manifests.secret(pool, {names.KEY_POOL: identity.new_key()})
 
         existing = await self._have(pool, SECRETS, name, new)
-        try:
-            identity.key_in(mapping(existing, "data"))
-        except identity.InvalidKey as error:
-            message = (
-                f"the Secret {name} has no valid key: {error}. Delete it: the operator makes a new "
-                "one. Then restart the master and the workers, which hold the old key."
-            )
-            raise _Obstructed(Obstacle(Reason.INVALID_CREDENTIALS, message, True)) from None
-        return text(mapping(existing, "metadata").get("creationTimestamp"))
+        remedy = (
+            "Delete it: the operator makes a new one. Then restart the master and the workers, "
+            "which hold the old key"
+        )
+        made = seconds(text(mapping(existing, "metadata").get("creationTimestamp")))
+        return PoolSecret(made, _signer(existing, remedy))
 
-    async def _check_brought(self, pool: FiberPool, name: str) -> None:
-        """Refuse a Secret that belongs to another pool, or that an earlier pool names too."""
+    async def _check_brought(self, pool: FiberPool, name: str) -> PoolSecret | None:
+        """Return the Secret; None while there is none.
+
+        Refuse one that belongs to another pool, or that an earlier pool names too.
+        """
         reserved = names.pool_of_secret(name)
         if reserved is None:
             self._check_users(pool, name)
@@ -201,10 +202,17 @@ class DependentsReconciler:
             raise _wrong_secret(name, why, reserved)
         try:
             existing = await self._cluster.read(SECRETS, pool.metadata.namespace, name)
-        except NotFound:
-            return  # the pods wait for it
+        except NotFound:  # the pods wait for it
+            return PoolSecret() if manifests.is_of_a_program(pool) else None
         if (other := manifests.other_owner(pool, existing)) is not None:
             raise _wrong_secret(name, f"which is the Secret of the FiberPool {other}", other)
+        if names.KEY_MASTER in mapping(existing, "data"):
+            return PoolSecret()
+        remedy = (
+            f"Put 64 random hexadecimal digits into the entry {names.KEY_POOL}: "
+            "`openssl rand -hex 32` prints some"
+        )
+        return PoolSecret(signer=_signer(existing, remedy))
 
     def _check_users(self, pool: FiberPool, name: str) -> None:
         """Refuse a Secret that an earlier pool names too."""
@@ -304,6 +312,16 @@ class DependentsReconciler:
         if not manifests.is_ours(pool, existing):
             raise _Obstructed(_taken(pool, resource, name, existing))
         return existing
+
+
+def _signer(secret: Body, remedy: str) -> signatures.Signer:
+    """Return the signer with the pool's key; ``remedy`` says what helps if there is no key."""
+    try:
+        return signatures.pool_signer(identity.key_in(mapping(secret, "data")))
+    except identity.InvalidKey as error:
+        name = text(mapping(secret, "metadata").get("name"))
+        message = f"the Secret {name} has no valid key: {error}. {remedy}."
+        raise _Obstructed(Obstacle(Reason.INVALID_CREDENTIALS, message, True)) from None
 
 
 def _concerns_budget(pool: FiberPool, known: Dependents | None) -> bool:

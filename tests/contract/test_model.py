@@ -46,6 +46,7 @@ FULL_SPEC: dict[str, Any] = {
     "workerContainer": "worker",
     "master": {
         **MASTER,
+        "certificate": "ab" * 32,
         "leaseName": "es",
         "leaseDurationSeconds": 30,
         "lostGraceSeconds": 60,

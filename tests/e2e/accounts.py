@@ -7,7 +7,6 @@ from pathlib import Path
 
 from e2e.kube import Body
 from e2e.scene import Scene
-from fiber_api import names
 
 ACCOUNT = "master"
 
@@ -22,17 +21,6 @@ def may_use_pools(scene: Scene) -> None:
         "subjects": [{"kind": "ServiceAccount", "name": ACCOUNT, "namespace": scene.namespace}],
     }
     scene.kube.create(scene.path("rolebindings"), binding)
-
-
-def may_read_credentials(scene: Scene, pool: str) -> None:
-    """Grant the rights that a warm pool needs beyond fiber-user's, as the chart's README says."""
-    secret = f"--resource-name={names.secret_name(pool)}"
-    account = f"--serviceaccount={scene.namespace}:{ACCOUNT}"
-    for arguments in (
-        ("role", pool, "--verb=get", "--resource=secrets", secret),
-        ("rolebinding", pool, f"--role={pool}", account),
-    ):
-        scene.kube.kubectl("--namespace", scene.namespace, "create", *arguments)
 
 
 def make_account(scene: Scene, name: str) -> None:

@@ -30,15 +30,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from fiber._transport.credentials import MasterCredentials, make_credentials
+from fiber._transport.credentials import WarmCredentials, make_certificate
 from fiber._transport.link import Link
 from fiber._transport.listener import MasterListener
 from fiber._transport.loop import Loop
 from fiber._wire.messages import Recall
-from fiber_api import identity, names
+from fiber_api import names
 
 ACCOUNT = Path("/var/run/secrets/kubernetes.io/serviceaccount")
 IDENTITY = f"{socket.gethostname()}:{os.getpid()}"
+_LOOK = 0.05  # seconds between two looks at the pool
 
 
 class Api:
@@ -53,29 +54,40 @@ class Api:
             self._url = f"https://{names.address_of(host, int(port))}"
             self._token = (ACCOUNT / "token").read_text()
             self._context = ssl.create_default_context(cafile=str(ACCOUNT / "ca.crt"))
-        self._secret = f"/api/v1/namespaces/{namespace}/secrets/{names.secret_name(pool)}"
         self._pool = f"/apis/{names.API_VERSION}/namespaces/{namespace}/{names.PLURAL}/{pool}"
 
-    def credentials(self) -> MasterCredentials:
-        """The master's, for the key of the pool."""
-        return make_credentials(identity.key_in(self._call("GET", self._secret)["data"]))
+    def status(self, wanted: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+        """Wait until the pool's status is as wanted, and return it."""
+        while True:
+            status: dict[str, Any] = self._call("GET", self._pool).get("status", {})
+            if wanted(status):
+                return status
+            time.sleep(_LOOK)
 
-    def attach(self, master: dict[str, Any], on_epoch: Callable[[int], None]) -> int:
-        """Be the pool's master, with an epoch above those of all before; which that is.
+    def credentials(self) -> WarmCredentials:
+        """The master's, with which it knows the agents of the pool."""
+        status = self.status(lambda status: "publicKey" in status)
+        return WarmCredentials(bytes.fromhex(status["publicKey"]), make_certificate())
 
-        ``on_epoch`` gets it before an agent can dial.
-        """
+    def attach(self, master: dict[str, Any]) -> int:
+        """Be the pool's master, with an epoch above those of all before; which that is."""
         epoch = 0
 
         def next_one(pool: dict[str, Any]) -> dict[str, Any]:
             nonlocal epoch
             there = pool["spec"].get("master", {}).get("epoch", 0)
             epoch = 1 + int(max(there, pool.get("status", {}).get("masterEpoch", 0)))
-            on_epoch(epoch)
             return {"master": {**master, "epoch": epoch}}
 
         self._apply(next_one)
         return epoch
+
+    def sign(self, credentials: WarmCredentials, epoch: int) -> None:
+        """Wait for the operator's signature for this master, and take it."""
+        status = self.status(
+            lambda status: "masterSignature" in status and status.get("masterEpoch") == epoch
+        )
+        assert credentials.take_signature(epoch, bytes.fromhex(status["masterSignature"]))
 
     def detach(self, epoch: int) -> None:
         """Leave the pool without a master, unless it has another one by now."""
@@ -163,20 +175,29 @@ def main() -> None:
     loop = Loop()
     loop.start_thread("master-io")
     agents: list[Agent] = []
+    credentials = api.credentials()
     listener = MasterListener(
         loop,
         names.address_of(host, 0),
-        api.credentials(),
+        credentials,
         on_agent=lambda link: agents.append(Agent(link, loop, say)),
         on_refused=lambda reason: say("refused", reason=reason),
         lost_grace=lost_grace,
     )
     port = int(listener.address.rpartition(":")[2])
-    master: dict[str, Any] = {"host": host, "port": port, "identity": IDENTITY}
+    certificate = credentials.certificate.hash.hex()
+    master: dict[str, Any] = {
+        "host": host,
+        "port": port,
+        "identity": IDENTITY,
+        "certificate": certificate,
+    }
     if lost_grace is not None:
         master["lostGraceSeconds"] = lost_grace
     started = time.monotonic()
-    epoch = api.attach(master, listener.take_epoch)
+    epoch = api.attach(master)
+    api.sign(credentials, epoch)
+    loop.call_soon(listener.look_again)
     say("attached", address=listener.address, epoch=epoch)
     told = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: told.set())

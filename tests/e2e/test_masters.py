@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from e2e.accounts import may_read_credentials, may_use_pools
+from e2e.accounts import may_use_pools
 from e2e.clusters import Cluster
 from e2e.delays import record
 from e2e.kube import Body
@@ -99,7 +99,6 @@ def test_workers_are_ready_once_a_master_has_answered_them(
 
 def test_a_master_in_the_cluster(pool: Pool, agent: Body, image: str) -> None:
     may_use_pools(pool.scene)
-    may_read_credentials(pool.scene, pool.name)
     pool.apply(agent, minReplicas=2)
     workers = pool.ready(2)
     first = Inside(pool, image)

@@ -6,7 +6,6 @@ import re
 
 import pytest
 
-from e2e.accounts import may_read_credentials
 from e2e.clusters import Cluster
 from e2e.delays import record
 from e2e.kube import Body, path_of
@@ -130,7 +129,6 @@ def test_a_process_with_a_gpu_runs_on_a_node_that_has_one(
 
 def test_a_warm_pool_is_given_back_as_it_was(programs: Programs, scene: Scene, agent: Body) -> None:
     warm = Pool(scene, "warm").apply(agent, minReplicas=2)
-    may_read_credentials(scene, "warm")
     there = warm.ready(2)
     program = programs.start("outside", "mapping.py", "--workers", 2, pool="warm")
     assert program.says("done")["hosts"] == there

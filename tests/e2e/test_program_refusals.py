@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from e2e.accounts import ACCOUNT, may_read_credentials
+from e2e.accounts import ACCOUNT
 from e2e.clusters import Cluster
 from e2e.kube import Body, Refused, path_of
 from e2e.leftovers import leaves_nothing
@@ -163,7 +163,6 @@ def test_a_second_program_learns_which_program_holds_a_pool(
     programs: Programs, scene: Scene, agent: Body
 ) -> None:
     warm = Pool(scene, "warm").apply(agent, minReplicas=2)
-    may_read_credentials(scene, "warm")
     there = warm.ready(2)
     work = ("--workers", 2, "--tasks", 60, "--stay")
     first = programs.start("outside", "mapping.py", *work, pool="warm")

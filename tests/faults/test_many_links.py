@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from faults.program import Program
-from fiber._transport.credentials import MasterCredentials, make_credentials
+from fiber._transport.credentials import OwnCredentials, make_credentials
 from fiber._transport.link import Link
 from fiber._transport.link_protocol import Frame
 from fiber._transport.listener import MasterListener
@@ -54,7 +54,7 @@ AGENTS = """
 class Master:
     """Master that accepts every agent and counts its messages."""
 
-    def __init__(self, credentials: MasterCredentials) -> None:
+    def __init__(self, credentials: OwnCredentials) -> None:
         self.links: list[Link] = []
         self.lost: list[str] = []
         self.joined, self.answered = threading.Event(), threading.Event()

@@ -12,13 +12,14 @@ import subprocess
 import sys
 import textwrap
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 
 from faults.program import Program, wait_for
-from fiber._transport.credentials import MasterCredentials, make_credentials
+from fiber._transport.credentials import WarmCredentials, make_certificate
+from warm_key import WarmKey
 
 AGENT = """
     import runpy, sys
@@ -66,9 +67,8 @@ MASTER = """
     listener = MasterListener(
         loop, sys.argv[2], pickle.load(open(sys.argv[1], "rb")),
         on_agent=joined, on_refused=lambda reason: None,
-        keepalive=Keepalive(0.2, 0.5, 1.0), lost_grace=float(sys.argv[4]) if sys.argv[4:] else None,
+        keepalive=Keepalive(0.2, 0.5, 1.0), lost_grace=float(sys.argv[3]) if sys.argv[3:] else None,
     )
-    listener.take_epoch(int(sys.argv[3]))
     print("listens", flush=True)
     loop.run()
 """
@@ -78,17 +78,15 @@ class Pool:
     """Address where masters come and go, and one agent that dials it."""
 
     def __init__(self, launch: Callable[..., Program], folder: Path) -> None:
-        self.credentials: MasterCredentials = make_credentials("ab" * 32)
-        self._path = folder / "credentials"
-        self._path.write_bytes(pickle.dumps(self.credentials))
+        self.key = WarmKey()
+        self._folder = folder
         self._launch = launch
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self.address = f"127.0.0.1:{free.getsockname()[1]}"
 
     def agent(self, grace: float, script: str = AGENT, epoch: int = 0, **env: str) -> Program:
-        credentials = replace(self.credentials.agent("warm-0", "uid"), epoch=epoch)
-        inherited = credentials.to_descriptor()
+        inherited = self.key.agent("warm-0", "uid", epoch).to_descriptor()
         told = {
             "FIBER_AGENT_ADDRESS": self.address,
             "FIBER_AGENT_CREDENTIALS": f"fd:{inherited}",
@@ -103,12 +101,14 @@ class Pool:
 
     def stranger(self) -> Program:
         """Start the master of another pool at the same address."""
-        path = self._path.with_name("others")
-        path.write_bytes(pickle.dumps(make_credentials("cd" * 32)))
-        return self.master(path=path)
+        return self.master(credentials=WarmKey().master(1))
 
-    def master(self, *grace: str, path: Path | None = None, epoch: int = 0) -> Program:
-        master = self._launch(MASTER, str(path or self._path), self.address, str(epoch), *grace)
+    def master(
+        self, *grace: str, epoch: int = 1, credentials: WarmCredentials | None = None
+    ) -> Program:
+        path = self._folder / f"master-{epoch}"
+        path.write_bytes(pickle.dumps(credentials or self.key.master(epoch)))
+        master = self._launch(MASTER, str(path), self.address, *grace)
         assert master.line() == "listens"
         return master
 
@@ -150,16 +150,36 @@ def test_an_agent_serves_no_master_before_the_one_that_its_pod_was_made_for(pool
     assert pool.master(epoch=2).line() == "joined warm-0"
 
 
+def test_an_earlier_master_gets_the_agent_of_a_later_one_no_more(pool: Pool) -> None:
+    """The earlier master still has all that it ever knew, and the address of the pool."""
+    agent = pool.agent(grace=30)
+    earlier, later = pool.key.master(1), pool.key.master(2)
+    for credentials in (earlier, later):
+        master = pool.master(credentials=credentials)
+        assert master.line() == "joined warm-0"
+        master.signal(signal.SIGTERM)
+        assert master.wait() == 0
+    again = pool.master(credentials=earlier)
+    wait_for(lambda: "has epoch 1, and this agent belongs to a later one" in agent.stderr)
+    again.kill()
+
+
 def test_an_agent_that_refuses_all_later_masters_ends(pool: Pool) -> None:
-    """The first master claims an epoch that the pool never had."""
-    agent = pool.agent(grace=1)
-    first = pool.master(epoch=2**53)
-    assert first.line() == "joined warm-0"
-    first.signal(signal.SIGTERM)
-    assert first.wait() == 0
+    """Its pool was deleted and made anew, so that the epochs begin again."""
+    agent = pool.agent(grace=1, epoch=9)
     pool.master(epoch=2)
     assert agent.wait() == 0
-    assert f"this agent belongs to a later one, of epoch {2**53}" in agent.stderr
+    assert "this agent belongs to a later one, of epoch 9" in agent.stderr
+
+
+def test_a_master_that_the_operator_has_not_signed_for_gets_no_agent(pool: Pool) -> None:
+    agent = pool.agent(grace=30)
+    certificate = make_certificate()
+    forged = pool.key.unsigned(certificate)
+    forged._proof = (1).to_bytes(8, "big") + bytes(64)
+    pool.master(credentials=forged)
+    assert agent.wait() == 1
+    assert "it cannot prove that it is this pool's master" in agent.stderr
 
 
 PLANTED = """
@@ -219,7 +239,7 @@ subprocess.run([*command, statement.partition("import runpy")[0] + show], check=
 
 def test_credentials_from_a_file_serve_for_all_its_masters(pool: Pool, tmp_path: Path) -> None:
     file = tmp_path / "agent.json"
-    file.write_text(json.dumps(asdict(pool.credentials.agent("warm-0", "uid"))))
+    file.write_text(json.dumps(asdict(pool.key.agent("warm-0", "uid"))))
     pool.agent(30, FIBER_AGENT_CREDENTIALS=str(file))
     for _ in range(3):
         master = pool.master()

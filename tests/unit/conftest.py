@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 import fiber
-from fiber._transport.credentials import MasterCredentials, make_credentials
+from fiber._transport.credentials import OwnCredentials, make_credentials
 from fiber.connection import Connection
 from hosts import Far
 from unit.executor_rig import Rig
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 
 
 @pytest.fixture(scope="module")
-def credentials() -> MasterCredentials:
+def credentials() -> OwnCredentials:
     return make_credentials()
 
 
 @pytest.fixture
-def site(credentials: MasterCredentials) -> Iterator[Site]:
+def site(credentials: OwnCredentials) -> Iterator[Site]:
     from unit.link_site import Site  # it starts nng, which is for the tests of links alone
 
     site = Site(credentials)

@@ -76,9 +76,7 @@ class Told:
     def connected(self) -> int:
         return self.agents
 
-    def on_epoch(self, epoch: int) -> None: ...
-
-    def on_attached(self, epoch: int) -> None:
+    def on_attached(self) -> None:
         self._note(self.attached, True)
 
     def on_status(self, status: Body) -> None:
@@ -162,7 +160,7 @@ class Rig:
 
     def warm(self, told: Told, master: PoolMaster = MASTER, name: str = "warm") -> FiberPoolClient:
         """A client that attaches to one."""
-        return self._client(WarmPool(self.api, NAMESPACE, name, master, told.on_epoch), told)
+        return self._client(WarmPool(self.api, NAMESPACE, name, master), told)
 
     def pool(self, name: str = "es-1") -> Body:
         """The pool as it is now."""

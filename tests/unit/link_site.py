@@ -15,7 +15,7 @@ import pynng
 from fiber._transport import authentication
 from fiber._transport.acceptor import Acceptor
 from fiber._transport.authentication import Identity
-from fiber._transport.credentials import Credentials, MasterCredentials
+from fiber._transport.credentials import Credentials, MasterCredentials, OwnCredentials
 from fiber._transport.dialer import AgentDialer
 from fiber._transport.link import Keepalive, Link
 from fiber._transport.link_protocol import Frame
@@ -86,7 +86,7 @@ class Notes:
 class Site:
     """A loop with listeners and dialers on it, all closed at the end."""
 
-    def __init__(self, credentials: MasterCredentials) -> None:
+    def __init__(self, credentials: OwnCredentials) -> None:
         self.credentials = credentials
         self.loop = Loop()
         self.loop.start_thread("test-io")
@@ -214,7 +214,7 @@ def say(address: str, credentials: Credentials, words: bytes) -> bytes:
     sock = socket.create_connection(("127.0.0.1", port_of(address)))
     handshake = authentication.AgentHandshake(sock, authentication.agent_context())
     try:
-        return complete(handshake, handshake.ask(credentials, words))
+        return complete(handshake, handshake.ask(credentials, words))[0]
     finally:
         handshake.close()
 

@@ -13,17 +13,17 @@ from pathlib import Path
 import pytest
 
 from fiber._transport import credentials_file
-from fiber._transport.credentials import Credentials, MasterCredentials, make_credentials
+from fiber._transport.credentials import Credentials, OwnCredentials, make_credentials
 from fiber.errors import ConfigError
 from fiber_api import identity, names
 
 
 @pytest.fixture(scope="module")
-def credentials() -> MasterCredentials:
+def credentials() -> OwnCredentials:
     return make_credentials()
 
 
-def test_each_agent_has_a_separate_key(credentials: MasterCredentials) -> None:
+def test_each_agent_has_a_separate_key(credentials: OwnCredentials) -> None:
     pods = [("a", "1"), ("a", "2"), ("b", "1"), ("a1", ""), ("a 1", "2"), ("a", "1 2")]
     keys = {credentials.agent(*pod).key for pod in pods}
     assert len(keys) == len(pods)
@@ -31,20 +31,13 @@ def test_each_agent_has_a_separate_key(credentials: MasterCredentials) -> None:
     assert credentials.agent("a", "1") == credentials.agent("a", "1")
 
 
-def test_each_run_has_its_own_key_and_certificate(credentials: MasterCredentials) -> None:
+def test_each_run_has_its_own_key_and_certificate(credentials: OwnCredentials) -> None:
     other = make_credentials()
     assert other.pool_key != credentials.pool_key
     assert other.certificate != credentials.certificate
 
 
-def test_the_next_master_of_a_pool_has_another_certificate(credentials: MasterCredentials) -> None:
-    first, second = (make_credentials(credentials.pool_key) for _ in range(2))
-    assert first.certificate.hash != second.certificate.hash
-    assert first.agent("a", "1") == second.agent("a", "1")
-    assert first.fingerprint == ""
-
-
-def mounted(folder: Path, credentials: MasterCredentials) -> dict[str, str]:
+def mounted(folder: Path, credentials: OwnCredentials) -> dict[str, str]:
     """The environment of an init container that mounts the Secret of a program's own pool."""
     (folder / names.KEY_POOL).write_text(credentials.pool_key + "\n")
     (folder / names.KEY_MASTER).write_text(credentials.fingerprint)
@@ -58,7 +51,7 @@ def mounted(folder: Path, credentials: MasterCredentials) -> dict[str, str]:
 
 
 def test_the_agent_reads_the_init_containers_output_once(
-    credentials: MasterCredentials, tmp_path: Path
+    credentials: OwnCredentials, tmp_path: Path
 ) -> None:
     environment = mounted(tmp_path, credentials)
     before = os.umask(0)
@@ -85,7 +78,7 @@ def test_the_agent_reads_the_init_containers_output_once(
     ],
 )
 def test_an_init_container_that_cannot_write_says_why(
-    credentials: MasterCredentials, tmp_path: Path, fault: object, said: str
+    credentials: OwnCredentials, tmp_path: Path, fault: object, said: str
 ) -> None:
     environment = mounted(tmp_path, credentials)
     assert callable(fault)
@@ -100,8 +93,8 @@ def test_an_init_container_that_cannot_write_says_why(
     assert not (tmp_path / "agent.json").exists()
 
 
-def test_the_init_container_imports_the_standard_library_alone(
-    credentials: MasterCredentials, tmp_path: Path
+def test_the_init_container_of_an_own_pool_imports_the_standard_library_alone(
+    credentials: OwnCredentials, tmp_path: Path
 ) -> None:
     statement = (
         "import sys, runpy; sys.argv = ['agent']\n"
@@ -130,7 +123,7 @@ def test_a_file_that_cannot_be_read_is_named_with_the_reason(
         Credentials.from_file(tmp_path / "agent.json")
 
 
-def test_a_descriptor_brings_them_once(credentials: MasterCredentials) -> None:
+def test_a_descriptor_brings_them_once(credentials: OwnCredentials) -> None:
     agent = credentials.agent("a", "1")
     descriptor = agent.to_descriptor()
     assert not os.get_inheritable(descriptor)
@@ -162,8 +155,8 @@ def test_an_invalid_descriptor_is_named(descriptor: int) -> None:
         Credentials.from_descriptor(descriptor)
 
 
-def test_no_secret_in_a_repr(credentials: MasterCredentials) -> None:
-    assert repr(credentials) == "MasterCredentials(only=True)"
+def test_no_secret_in_a_repr(credentials: OwnCredentials) -> None:
+    assert repr(credentials) == "OwnCredentials()"
     assert credentials.agent("a", "1").key not in repr(credentials.agent("a", "1"))
 
 

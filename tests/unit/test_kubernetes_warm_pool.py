@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -11,8 +10,6 @@ import pytest
 
 from fakes.kubernetes_api import Fault
 from fiber._backends.kubernetes import fiber_pool
-from fiber._backends.kubernetes.attached_pool import read_pool_key
-from fiber.errors import FiberPoolError
 from fiber_api import names
 from unit.kubernetes_rig import MASTER, NAMESPACE, OTHER, Body, Rig, Told, pool_body
 from unit.kubernetes_rig import rig as make_rig
@@ -111,16 +108,6 @@ def test_the_next_master_has_a_higher_epoch_and_the_same_lease(rig: Rig, told: T
     taken = rig.get("leases", names.master_lease_name("warm"))
     assert taken["spec"]["holderIdentity"] == OTHER.identity
     assert taken["spec"]["acquireTime"] == taken["spec"]["renewTime"]
-
-
-def test_the_epoch_is_reported_before_an_agent_can_dial(
-    rig: Rig, told: Told, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    seen: list[tuple[int, bool]] = []
-    monkeypatch.setattr(told, "on_epoch", lambda epoch: seen.append((epoch, "master" in spec(rig))))
-    rig.warm(told)
-    has_master(rig, told, 1)
-    assert seen == [(1, False)]
 
 
 def test_a_lease_without_the_label_gets_it(rig: Rig, told: Told) -> None:
@@ -265,47 +252,6 @@ def test_leftovers_are_named_with_the_command_that_detaches(
     said = capsys.readouterr().err
     assert "kubectl patch fiberpool warm -n lab --type=merge" in said
     assert '{"spec": {"master": null, "replicas": 0}}' in said
-
-
-# -- Its credentials
-
-
-def make_secret(rig: Rig, name: str = names.secret_name("warm"), **changed: str) -> None:
-    texts = {names.KEY_POOL: "ab" * 32} | changed
-    data = {key: base64.b64encode(text.encode()).decode() for key, text in texts.items()}
-    body = {"metadata": {"name": name}, "data": data}
-    rig.server.do(rig.server.store.create, "secrets", NAMESPACE, body)
-
-
-def pool_key(rig: Rig) -> str:
-    return read_pool_key(rig.api, NAMESPACE, "warm", rig.spec("warm"))
-
-
-def test_the_key_that_the_operator_made_is_read(rig: Rig) -> None:
-    make_secret(rig)
-    assert pool_key(rig) == "ab" * 32
-
-
-def test_a_key_that_cannot_serve(rig: Rig) -> None:
-    make_secret(rig, **{names.KEY_POOL: "damaged"})
-    with pytest.raises(FiberPoolError, match=r"key does not hold.*delete it") as caught:
-        pool_key(rig)
-    assert caught.value.reason == "InvalidCredentials"
-    assert "damaged" not in str(caught.value)
-
-
-def test_a_key_that_this_program_may_not_read(rig: Rig) -> None:
-    rig.server.api.faults.append(Fault("get", "secrets", status=403, message="no secrets"))
-    with pytest.raises(FiberPoolError, match=r"no secrets.*--resource-name=warm-") as caught:
-        pool_key(rig)
-    assert caught.value.reason == "Forbidden"
-
-
-def test_a_key_that_the_pools_owner_brought(rig: Rig) -> None:
-    make_secret(rig, "brought")
-    patch = {"spec": {"credentialsSecretName": "brought"}}
-    rig.server.do(rig.server.store.merge, names.PLURAL, NAMESPACE, "warm", patch)
-    assert pool_key(rig) == "ab" * 32
 
 
 def test_the_error_of_a_deleted_warm_pool_asks_its_owner_to_make_it_again(

@@ -231,11 +231,11 @@ def test_a_stolen_agents_key_opens_no_other_agents_link(site: Site, claims: str)
 
 def test_the_path_with_a_stolen_agents_key_is_no_master(site: Site) -> None:
     """Nor can who has such a key sit in the middle: an agent expects the master's name."""
-    stolen = replace(make_credentials("ab" * 32), pool_key=site.credentials.agent("b", "uid").key)
+    stolen = replace(make_credentials(), pool_key=site.credentials.agent("b", "uid").key)
     middle = Site(stolen)
     try:
         listener, _ = middle.listener()
-        victim = replace(site.credentials.agent("agent-1", "uid"), master="")  # of a warm pool
+        victim = replace(site.credentials.agent("agent-1", "uid"), master="")
         _, agent = site.dialer(listener.address, credentials=victim)
         agent.wait(lambda: agent.errors)
     finally:
@@ -245,10 +245,9 @@ def test_the_path_with_a_stolen_agents_key_is_no_master(site: Site) -> None:
 
 def test_a_proof_is_good_for_one_master_alone(site: Site) -> None:
     """Relay with another certificate in the middle: an agent's proof cannot be passed on."""
-    pool_key = site.credentials.pool_key
     listener, master = site.listener()
     middle = authentication.agent_context()
-    credentials = make_credentials(pool_key).agent("agent-1", "uid")
+    credentials = replace(site.credentials.agent("agent-1", "uid"), master="")
     hello = AgentHello(Identity.of_this_process("agent-1", "uid"), "0" * 32, 0, False).encode()
     sock = socket.create_connection(("127.0.0.1", port_of(listener.address)), PATIENCE)
     handshake = authentication.AgentHandshake(sock, middle)

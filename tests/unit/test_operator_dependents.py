@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import base64
 from typing import Any
 
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from fakes import virtual_time
 from fakes.kubernetes_api import Fault
 from fakes.world import NAMESPACE, World, a_world, played
+from fiber_api.signatures import pool_signer
 from unit.operator_objects import MASTER
 
 LABELS = {"fiber.dev/pool": "es", "fiber.dev/pool-uid": "1"}
@@ -85,6 +87,41 @@ def test_a_secret_that_an_earlier_pool_names_too_is_refused() -> None:
             await world.ready(2, "another")
 
     virtual_time.run(main())
+
+
+def bring(world: World, name: str, **texts: str) -> None:
+    data = {key: base64.b64encode(text.encode()).decode() for key, text in texts.items()}
+    world.store.create("secrets", NAMESPACE, {"metadata": {"name": name}, "data": data})
+
+
+@played
+async def test_a_brought_secret_gives_the_public_key_once_it_is_there(world: World) -> None:
+    world.make_pool(replicas=1, credentialsSecretName="mine")
+    await world.ready(1)
+    assert "publicKey" not in world.status()
+    bring(world, "mine", key="ab" * 32)
+    world.edit(replicas=2)
+    await world.ready(2)
+    assert world.status()["publicKey"] == pool_signer("ab" * 32).public_key.hex()
+
+
+@played
+async def test_a_secret_that_names_the_only_master_gives_no_public_key(world: World) -> None:
+    bring(world, "mine", key="ab" * 32, master="cd" * 32)
+    world.make_pool(replicas=1, credentialsSecretName="mine")
+    await world.ready(1)
+    assert "publicKey" not in world.status()
+
+
+@played
+async def test_a_brought_secret_without_a_valid_key_is_a_problem(world: World) -> None:
+    bring(world, "mine", key="secret")
+    world.make_pool(replicas=1, credentialsSecretName="mine")
+    await world.until(lambda: "InvalidCredentials" in world.reasons(), 30)
+    message = world.status()["problems"][0]["message"]
+    assert "the Secret mine has no valid key" in message
+    assert "openssl rand -hex 32" in message
+    assert "secret" not in message
 
 
 def test_a_secret_that_names_the_pool_as_its_owner_is_taken() -> None:

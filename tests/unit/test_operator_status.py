@@ -6,9 +6,11 @@ from typing import Any
 
 import pytest
 
+from fiber_api.signatures import is_signed, master_statement, pool_signer
 from fiber_api.v1alpha1 import FiberPool, FiberPoolStatus
 from fiber_operator.planning import plans
 from fiber_operator.planning.manifests import template_hash
+from fiber_operator.planning.plans import PoolSecret
 from fiber_operator.planning.pods import PodState
 from fiber_operator.planning.reconcile import plan_unreadable
 from unit.operator_cluster_model import view
@@ -16,6 +18,7 @@ from unit.operator_objects import (
     MASTER,
     NOW,
     UID,
+    edited,
     ended,
     make_pool,
     of_template,
@@ -63,6 +66,51 @@ def test_the_highest_epoch_is_remembered_without_a_master() -> None:
     pool = make_pool({"masterEpoch": 5})
     status = status_of(pool)
     assert (status.master, status.master_epoch) == (None, 5)
+
+
+# -- The signature for the master
+
+CERTIFICATE = "c7" * 32
+SIGNED = {**MASTER, "epoch": 3, "certificate": CERTIFICATE}
+SIGNER = pool_signer("ab" * 32)
+WARM = PoolSecret(signer=SIGNER)
+
+
+def is_valid(status: FiberPoolStatus, epoch: int = 3) -> bool:
+    assert status.public_key
+    assert status.master_signature
+    statement = master_statement(epoch, bytes.fromhex(CERTIFICATE))
+    key, signature = bytes.fromhex(status.public_key), bytes.fromhex(status.master_signature)
+    return is_signed(key, statement, signature)
+
+
+def test_the_master_of_a_warm_pool_gets_a_signature_for_its_epoch() -> None:
+    status = status_of(make_pool(master=SIGNED), secret=WARM)
+    assert is_valid(status)
+    assert not is_valid(status, epoch=4)
+
+
+def test_a_pool_without_a_master_has_its_public_key_alone() -> None:
+    status = status_of(make_pool(), secret=WARM)
+    assert status.public_key == SIGNER.public_key.hex()
+    assert status.master_signature is None
+    assert status_of(make_pool(master={**MASTER, "epoch": 3}), secret=WARM).master_signature is None
+
+
+def test_a_pool_with_one_master_needs_no_signature() -> None:
+    status = status_of(make_pool(master=SIGNED), secret=PoolSecret())
+    assert (status.public_key, status.master_signature) == (None, None)
+
+
+@pytest.mark.parametrize("knowledge", [{"secret": None}, {"secret": WARM, "led": False}])
+def test_a_signature_stays_for_its_epoch_until_more_is_known(knowledge: dict[str, Any]) -> None:
+    seen = with_plan(make_pool(master=SIGNED), plan_of(make_pool(master=SIGNED), secret=WARM))
+    status = status_of(seen, **knowledge)
+    assert is_valid(status)
+    later = edited(seen, master={**SIGNED, "epoch": 4})
+    status = status_of(later, **knowledge)
+    assert status.master_signature is None
+    assert status.public_key == SIGNER.public_key.hex()
 
 
 # -- Conditions and the phase

@@ -6,7 +6,7 @@ import pytest
 
 from fiber._transport.acceptor import Acceptor
 from fiber._transport.authentication import Identity
-from fiber._transport.credentials import MasterCredentials, make_credentials
+from fiber._transport.credentials import OwnCredentials, make_credentials
 from fiber.errors import AuthenticationError, LinkError
 from unit.link_site import Notes, Site
 
@@ -17,14 +17,14 @@ def acceptor(site: Site) -> Acceptor:
 
 
 @pytest.fixture
-def pools(site: Site) -> list[MasterCredentials]:
+def pools(site: Site) -> list[OwnCredentials]:
     """Two pools of one program: their keys differ, and the certificate is the same."""
     other = make_credentials(certificate=site.credentials.certificate)
     return [site.credentials, other]
 
 
 def test_each_agent_comes_to_the_pool_whose_key_it_has(
-    site: Site, acceptor: Acceptor, pools: list[MasterCredentials]
+    site: Site, acceptor: Acceptor, pools: list[OwnCredentials]
 ) -> None:
     masters = [site.listener(acceptor, credentials=pool)[1] for pool in pools]
     for number, (pool, master) in enumerate(zip(pools, masters, strict=True)):
@@ -38,7 +38,7 @@ def test_each_agent_comes_to_the_pool_whose_key_it_has(
 
 
 def test_an_unknown_key_is_refused_and_reported_to_one_pool(
-    site: Site, acceptor: Acceptor, pools: list[MasterCredentials]
+    site: Site, acceptor: Acceptor, pools: list[OwnCredentials]
 ) -> None:
     masters = [site.listener(acceptor, credentials=pool)[1] for pool in pools]
     stranger = make_credentials(certificate=site.credentials.certificate)
@@ -52,7 +52,7 @@ def test_an_unknown_key_is_refused_and_reported_to_one_pool(
 
 
 def test_the_end_of_one_pool_leaves_the_others_and_tells_its_late_agents(
-    site: Site, acceptor: Acceptor, pools: list[MasterCredentials]
+    site: Site, acceptor: Acceptor, pools: list[OwnCredentials]
 ) -> None:
     (first, first_master), (_, second_master) = (
         site.listener(acceptor, credentials=pool) for pool in pools
@@ -73,7 +73,7 @@ def test_the_end_of_one_pool_leaves_the_others_and_tells_its_late_agents(
 
 
 def test_a_pool_comes_after_the_last_one_has_ended(
-    site: Site, acceptor: Acceptor, pools: list[MasterCredentials]
+    site: Site, acceptor: Acceptor, pools: list[OwnCredentials]
 ) -> None:
     first, _ = site.listener(acceptor, credentials=pools[0])
     site.close(first, linger=0.1)
@@ -83,7 +83,7 @@ def test_a_pool_comes_after_the_last_one_has_ended(
     master.wait(lambda: master.frames == [b"here"])
 
 
-def _dial(site: Site, acceptor: Acceptor, pool: MasterCredentials, name: str) -> Notes:
+def _dial(site: Site, acceptor: Acceptor, pool: OwnCredentials, name: str) -> Notes:
     identity = Identity.of_this_process(name, "uid")
     _, notes = site.dialer(acceptor.address, credentials=pool.agent(name, "uid"), identity=identity)
     return notes

@@ -70,8 +70,8 @@ user:
   - apiGroups: [fiber.dev]
     resources: [fiberpools]
     verbs: [create, delete, get, list, patch, watch]
-  # A master makes the credentials of its pool itself. It may read no Secret. For a pool of another owner, give it the
-  # right to get that pool's Secret by name (docs/fiberpools.md).
+  # A master makes the credentials of its own pool itself. It reads no Secret: for a pool of another owner, the operator
+  # signs its certificate in the status.
   - apiGroups: [""]
     resources: [secrets]
     verbs: [create]

@@ -159,9 +159,10 @@ class CutOff:
 def find_cut_off(pool: FiberPool, live: Sequence[PodView], knowledge: Knowledge) -> CutOff:
     """Find the pods that are cut off."""
     address = None if _names_its_own_address(pool) else knowledge.address
+    secret_made = knowledge.secret.made if knowledge.secret else 0.0
     return CutOff(
         [pod for pod in live if address and pod.address not in ("", address)],
-        [pod for pod in live if pod.created + API_SERVER_SKEW < knowledge.credentials_made],
+        [pod for pod in live if pod.created + API_SERVER_SKEW < secret_made],
     )
 
 

@@ -87,6 +87,11 @@ def secret(pool: FiberPool, data: Mapping[str, str]) -> dict[str, Any]:
     }
 
 
+def is_of_a_program(pool: FiberPool) -> bool:
+    """Return True if a program made the pool for itself."""
+    return pool.metadata.labels.get(names.LABEL_MANAGED_BY) == names.SDK_MANAGER
+
+
 def is_ours(pool: FiberPool, existing: Mapping[str, Any]) -> bool:
     """Return True if an existing object was made for this pool."""
     owners = items(mapping(existing, "metadata").get("ownerReferences"))

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from fiber_api.names import Reason
+from fiber_api.signatures import Signer
 
 QUOTA_IS_FULL = "exceeded quota"
 """Words of the API server if a quota is full."""
@@ -107,6 +108,16 @@ class LeaseVerdict:
 
 
 @dataclass(frozen=True)
+class PoolSecret:
+    """Secret of a pool."""
+
+    made: float = 0.0
+    """Creation time, if the operator made it; else 0.0."""
+    signer: Signer | None = None
+    """Signer with the pool's key; None if the Secret names the only master of the pool."""
+
+
+@dataclass(frozen=True)
 class Knowledge:
     """Knowledge of the operator about a pool, beside the resource and its pods.
 
@@ -117,8 +128,8 @@ class Knowledge:
     """``host:port`` of the pool's Service.  While it is None, no pod is created."""
     credentials: bool | None = None
     """True if the Secret belongs to the pool and has a valid key; None: it was not checked."""
-    credentials_made: float = 0.0
-    """Creation time of the pool's Secret."""
+    secret: PoolSecret | None = None
+    """The pool's Secret; None if there is none, or it was not checked."""
     obstacles: tuple[Obstacle, ...] = ()
     """Obstacles of the pool's objects.  While there is one, no pod is created."""
     led: bool = True

@@ -6,7 +6,7 @@ the environment variable with that name, the owner, Fiber's labels, the absence 
 ``restartPolicy: Never``.
 
 An init container gives each agent a separate key and hides the pool's key from tasks.  It mounts
-the pool's Secret, derives the agent's key from it and the pod's name and uid, and writes that key
+the pool's Secret, makes the agent's key, which proves the pod's name and uid, and writes that key
 to a volume in memory.  The agent reads the file and removes it.  The init container runs the
 worker's command on the worker's image, without the volumes, environment and working directory of
 the template, because a task could have written to these.  The exception is a volume that the
@@ -27,7 +27,7 @@ from fiber_api import names
 from fiber_api.v1alpha1 import FiberPool, MasterSpec
 from fiber_operator.planning.assessment import awaits_agents
 from fiber_operator.planning.documents import items, mapping, text
-from fiber_operator.planning.manifests import owner_reference, template_hash
+from fiber_operator.planning.manifests import is_of_a_program, owner_reference, template_hash
 from fiber_operator.planning.pods import PROBE_PROGRAM
 
 NODE_LOST_SECONDS = 60
@@ -86,7 +86,7 @@ def pod_maker(
 ) -> Callable[[str], dict[str, Any]]:
     """Return a function that makes a worker pod by name, with costly work done only once."""
     revision = template_hash(pool)
-    if pool.metadata.labels.get(names.LABEL_MANAGED_BY) == names.SDK_MANAGER:
+    if is_of_a_program(pool):
         requests = NO_REQUESTS  # a program has its own settings for these
     return lambda name: _pod(pool, name, address, revision, requests)
 

@@ -421,7 +421,8 @@ def _address_changed(situation: Situation, pod: PodView) -> str:
 
 def _credentials_changed(situation: Situation) -> str:
     pool = situation.pool.metadata
-    made = format_time(situation.knowledge.credentials_made)
+    secret = situation.knowledge.secret
+    made = format_time(secret.made if secret else 0.0)
     first, fate = "Delete the workers", _REPLACED[situation.pool.spec.update.strategy]
     if situation.master_state.attached:
         first, fate = (

@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 from fiber_api import names
 from fiber_api.names import ConditionType, Phase, Reason
+from fiber_api.signatures import master_statement
 from fiber_api.times import format_time
 from fiber_api.v1alpha1 import FiberPool, FiberPoolStatus, PoolCondition, Problem
 from fiber_operator.planning import manifests, messages
@@ -310,6 +311,8 @@ def describe(facts: Assessment, outlook: Outlook, account: Account) -> FiberPool
         endpoint=names.endpoint_of(knowledge.address) if knowledge.address else before.endpoint,
         master=leads_to if knowledge.led else before.master,
         master_epoch=max(epoch, before.master_epoch or 0) or None,
+        master_signature=_master_signature(facts),
+        public_key=_public_key(facts),
         idle_since=facts.idleness.since,
         credentials_secret=before.credentials_secret if knowledge.credentials is None else secret,
         template_hash=facts.template_hash,
@@ -318,6 +321,25 @@ def describe(facts: Assessment, outlook: Outlook, account: Account) -> FiberPool
         problems=outlook.problems,
         conditions=found,
     )
+
+
+def _public_key(facts: Assessment) -> str | None:
+    if (secret := facts.knowledge.secret) is None:
+        return facts.pool.status.public_key
+    return secret.signer.public_key.hex() if secret.signer else None
+
+
+def _master_signature(facts: Assessment) -> str | None:
+    """Return the signature for the master that the EndpointSlice leads to, if it asks for one."""
+    master, secret, before = facts.pool.spec.master, facts.knowledge.secret, facts.pool.status
+    if master is None or master.certificate is None:
+        return None
+    if secret is None or not facts.knowledge.led:
+        return before.master_signature if before.master_epoch == master.epoch else None
+    if secret.signer is None:
+        return None
+    statement = master_statement(master.epoch, bytes.fromhex(master.certificate))
+    return secret.signer.sign(statement).hex()
 
 
 def _connected(outlook: Outlook) -> int | None:

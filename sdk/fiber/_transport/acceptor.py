@@ -82,8 +82,8 @@ class Acceptor:
     Port 0 takes a free port, and a range such as 9000-9009 its first free port; the attribute
     ``address`` has the port.  Connections are accepted once there is a pool.
 
-    All pools show the same ``certificate``.  An agent does not name its pool: the key of its proof
-    tells the pool (decision 6).  A stranger has no pool, and is reported to the first one.
+    All pools show the same ``certificate``.  An agent does not name its pool: its proof tells the
+    pool (decision 6).  A stranger has no pool, and is reported to the first one.
     """
 
     def __init__(self, address: str, certificate: Certificate) -> None:
@@ -216,6 +216,7 @@ class PendingConnection:
         self._watched: int | None = None
         self._awaited = ""
         self._pool: ServedPool | None = None
+        self._agent = Identity("", 0, "", "")
 
     def start(self, sock: socket.socket) -> None:
         """Begin the handshake; PeerClosed if the peer has closed it already."""
@@ -238,12 +239,13 @@ class PendingConnection:
         if not isinstance(hello, AgentHello):
             self._distrust(f"{hello.identity.name!r} is no agent")
             return
-        name, uid = hello.identity.name, hello.identity.uid
+        self._agent = agent = hello.identity
         self._pool = self._acceptor.pool_of(
-            lambda credentials: self._handshake.believes(credentials.agent_key(name, uid))
+            lambda credentials: self._handshake.believes(credentials, agent)
         )
         if self._pool is None:
-            self._acceptor.report(self._host, self.origin, f"it cannot prove that it is {name!r}")
+            reason = f"it cannot prove that it is {agent.name!r}"
+            self._acceptor.report(self._host, self.origin, reason)
             self._run(self._handshake.disbelieve(), lambda _: self._close_after_alert())
         else:
             self._acceptor.make_room(self)
@@ -271,6 +273,9 @@ class PendingConnection:
     def turn_away(self, greeting: bytes, reason: str) -> None:
         """Answer the agent, close the connection, and report the refusal.  Any thread."""
         self.report_proven(reason)
+        if self._pool is None or not self._pool.credentials.complete:
+            self.drop()  # the agent would not believe an answer
+            return
         self._loop.call_soon(self._answer, greeting, lambda end: os.close(end[0]))
 
     def report_proven(self, reason: str) -> None:
@@ -280,16 +285,15 @@ class PendingConnection:
         )
 
     def _answer(self, greeting: bytes, then: Callable[[tuple[int, Secrets]], None]) -> None:
-        if self.gone:
+        if self.gone or self._pool is None:
             return
 
         def passed(end: tuple[int, Secrets]) -> None:
             self._leave()
             then(end)
 
-        self._run(
-            self._handshake.answer(greeting), lambda _: self._run(self._handshake.end(), passed)
-        )
+        answer = self._handshake.answer(self._pool.credentials, self._agent, greeting)
+        self._run(answer, lambda _: self._run(self._handshake.end(), passed))
 
     @property
     def gone(self) -> bool:

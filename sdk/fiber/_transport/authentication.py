@@ -20,10 +20,11 @@ exchange begins a link and resumes it on a new connection.  A greeting is one by
 JSON.  The fields of an identity are the same in every version, so that two sides that do not
 understand each other can still say why.
 
-A proof is an HMAC with the agent's own key, which the master derives.  It covers the random bytes
-of both sides, the certificate that TLS has shown, and the greeting beside it.  So it is valid for
-one connection with one master.  A peer in the middle, which shows another certificate, cannot pass
-it on.
+The agent's proof covers the random bytes of both sides, the certificate that TLS has shown, and the
+greeting beside it.  So it is valid for one connection with one master.  A peer in the middle, which
+shows another certificate, cannot pass it on.  The master's proof covers the same, or, in a warm
+pool, the certificate alone: TLS proves the rest.  ``fiber._transport.credentials`` makes and checks
+the proofs.
 
 Each side of the handshake is a generator: it yields the event (``select.POLLIN`` or ``POLLOUT``)
 for which it has to wait, and never blocks.  TLS works on the socket itself and not on buffers in
@@ -46,7 +47,7 @@ from collections.abc import Callable, Generator, Mapping
 from importlib import metadata
 from typing import Any, NamedTuple, TypeAlias, TypeVar
 
-from fiber._transport.credentials import Certificate, Credentials
+from fiber._transport.credentials import Certificate, Credentials, MasterCredentials
 from fiber._wire.messages import PROTOCOL, ProtocolError
 from fiber.errors import AuthenticationError, ConfigError, VersionMismatch
 
@@ -104,8 +105,6 @@ class MasterWelcome(NamedTuple):
     lost_grace: float | None = None
     """Seconds for which the agent waits for another master if this one is lost.  None: it uses its
     own setting, or waits for none."""
-    epoch: int = 0
-    """Number of this master among those that follow one another in a pool."""
 
     def encode(self) -> bytes:
         """Return the datagram."""
@@ -222,7 +221,6 @@ def _read_welcome(identity: Identity, fields: Mapping[str, Any]) -> MasterWelcom
         suspect_after=float(fields["suspect_after"]),
         lost_after=float(fields["lost_after"]),
         lost_grace=None if grace is None else float(grace),
-        epoch=int(fields.get("epoch", 0)),
     )
 
 
@@ -285,7 +283,7 @@ Steps: TypeAlias = Generator[int, None, _T]
 
 LARGEST_GREETING = 1 << 16
 _LENGTH = struct.Struct(">I")
-_PROOF_SIZE = 32
+_LONGEST_PROOF = 256
 
 
 class Untrusted(Exception):
@@ -389,23 +387,27 @@ class _Handshake:
             return self._theirs, self._ours
         return self._ours, self._theirs
 
-    def _proof(self, side: bytes, key: str, certificate: bytes, greeting: bytes) -> bytes:
-        """Compute the proof of ``side`` for ``greeting``."""
+    def _said(self, side: bytes, certificate: bytes, greeting: bytes) -> bytes:
+        """Return what the proof of ``side`` for ``greeting`` covers."""
         agent, master = self._nonces
-        said = b"fiber " + side + agent + master + certificate + greeting
-        return hmac.digest(bytes.fromhex(key), said, "sha256")
+        return b"fiber " + side + agent + master + certificate + greeting
 
     def _write(self, data: bytes) -> Steps[None]:
         rest = memoryview(data)
         while rest:
             rest = rest[(yield from self._when_ready(self.sock.send, rest)) :]
 
-    def _read(self) -> Steps[bytes]:
-        """Read a greeting."""
+    def _read(self, what: str, limit: int) -> Steps[bytes]:
+        """Read a greeting or a proof."""
         (size,) = _LENGTH.unpack((yield from self._read_exactly(_LENGTH.size)))
-        if size > LARGEST_GREETING:
-            raise ProtocolError(f"its greeting of {size} bytes is too long")
+        if size > limit:
+            raise ProtocolError(f"its {what} of {size} bytes is too long")
         return (yield from self._read_exactly(size))
+
+    def _read_proven(self) -> Steps[tuple[bytes, bytes]]:
+        """Read a greeting and its proof."""
+        greeting = yield from self._read("greeting", LARGEST_GREETING)
+        return greeting, (yield from self._read("proof", _LONGEST_PROOF))
 
     def _read_exactly(self, size: int) -> Steps[bytes]:
         data = b""
@@ -438,24 +440,28 @@ class AgentHandshake(_Handshake):
 
     _for_master = False
 
-    def ask(self, credentials: Credentials, hello: bytes) -> Steps[bytes]:
-        """Send ``hello`` with a proof; check the master's proof and return its answer."""
+    def ask(self, credentials: Credentials, hello: bytes) -> Steps[tuple[bytes, int]]:
+        """Send ``hello`` with a proof.
+
+        Check the master's proof, and return the master's answer and its epoch.
+        """
         yield from self._when_ready(self.sock.do_handshake)
         seen = hashlib.sha256(self.sock.getpeercert(binary_form=True) or b"").digest()
         if credentials.master and seen.hex() != credentials.master:
             raise Untrusted("its certificate is refused: it is not that of this agent's master")
         self._theirs = yield from self._read_exactly(SECRET_SIZE)
-        proof = self._proof(b"agent", credentials.key, seen, hello)
-        yield from self._write(self._ours + _LENGTH.pack(len(hello)) + hello + proof)
-        answer = yield from self._read()
-        proof = yield from self._read_exactly(_PROOF_SIZE)
+        proof = credentials.prove(self._said(b"agent", seen, hello))
+        yield from self._write(self._ours + _framed(hello) + _framed(proof))
+        answer, proof = yield from self._read_proven()
         if not answer:
             raise Untrusted(
                 "the master does not believe that this agent is the pod it claims to be"
             )
-        if not hmac.compare_digest(proof, self._proof(b"master", credentials.key, seen, answer)):
+        said = self._said(b"master", seen, answer)
+        epoch = credentials.epoch_of_master(said, seen, proof)
+        if epoch is None:
             raise Untrusted("it cannot prove that it is this pool's master")
-        return answer
+        return answer, epoch
 
 
 class MasterHandshake(_Handshake):
@@ -468,7 +474,6 @@ class MasterHandshake(_Handshake):
     ) -> None:
         super().__init__(sock, context)
         self._certificate = certificate.hash
-        self._key = ""
         self._greeting = self._agent_proof = b""
 
     def listen(self) -> Steps[bytes]:
@@ -476,26 +481,29 @@ class MasterHandshake(_Handshake):
         yield from self._when_ready(self.sock.do_handshake)
         yield from self._write(self._ours)
         self._theirs = yield from self._read_exactly(SECRET_SIZE)
-        self._greeting = yield from self._read()
-        self._agent_proof = yield from self._read_exactly(_PROOF_SIZE)
+        self._greeting, self._agent_proof = yield from self._read_proven()
         return self._greeting
 
-    def believes(self, key: str) -> bool:
-        """Tell whether the agent has ``key``.  If so, the master proves itself by this key."""
-        proof = self._proof(b"agent", key, self._certificate, self._greeting)
-        if not hmac.compare_digest(proof, self._agent_proof):
-            return False
-        self._key = key
-        return True
+    def believes(self, credentials: MasterCredentials, agent: Identity) -> bool:
+        """Return True if the peer has proved to be ``agent`` in the pool of ``credentials``."""
+        said = self._said(b"agent", self._certificate, self._greeting)
+        return credentials.believes(agent.name, agent.uid, said, self._agent_proof)
 
-    def answer(self, greeting: bytes) -> Steps[None]:
-        """Answer an agent whose proof is valid, and prove to be its master."""
-        proof = self._proof(b"master", self._key, self._certificate, greeting)
-        yield from self._write(_LENGTH.pack(len(greeting)) + greeting + proof)
+    def answer(
+        self, credentials: MasterCredentials, agent: Identity, greeting: bytes
+    ) -> Steps[None]:
+        """Answer ``agent``, which has proved itself, and prove to be its master."""
+        said = self._said(b"master", self._certificate, greeting)
+        proof = credentials.prove(agent.name, agent.uid, said)
+        yield from self._write(_framed(greeting) + _framed(proof))
 
     def disbelieve(self) -> Steps[None]:
         """Answer an agent whose proof is not valid."""
-        yield from self._write(_LENGTH.pack(0) + bytes(_PROOF_SIZE))
+        yield from self._write(_framed(b"") + _framed(b""))
+
+
+def _framed(data: bytes) -> bytes:
+    return _LENGTH.pack(len(data)) + data
 
 
 def _reason(error: Exception) -> str:

@@ -1,22 +1,30 @@
 """Credentials by which a master and an agent prove themselves to each other.
 
-A master has the key of the pool, and a certificate that it signed itself for this run of the
-program.  An agent has its own key.  The master derives that key again from the agent's name and
-uid, so it stores nothing about agents, and an agent cannot prove to be another one.
+A master has a certificate that it made for this run of the program.  There are two kinds of pools:
+
+* A pool with one master (``OwnCredentials``): the master has the key of the pool, and each agent a
+  key that is derived from it and the agent's name and uid.  The proofs are HMACs with that key.
+  The agent knows the fingerprint of the master's certificate.
+* A warm pool (``WarmCredentials``), where masters follow one another: an agent has a key pair, and
+  the pool has signed its public key for its name and uid.  The operator signs the fingerprint of
+  each master's certificate and the master's epoch.  No secret of one master is of use to the next
+  one.
 """
 
 from __future__ import annotations
 
 import datetime
 import hashlib
+import hmac
 import json
 import os
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
+from typing import Protocol
 
 from fiber._transport import credentials_file
 from fiber.errors import ConfigError
-from fiber_api import identity
+from fiber_api import identity, signatures
 
 _VALIDITY = datetime.timedelta(days=3650)
 """Validity of a certificate.  No side reads it: agents compare the certificate's fingerprint."""
@@ -29,10 +37,13 @@ class Credentials:
     name: str
     uid: str
     key: str = field(repr=False)
-    """Key of the agent, derived from the key of the pool."""
+    """Secret of the agent: derived from the key of the pool, or the secret of its key pair."""
     master: str = ""
-    """Fingerprint of the only master that this agent may have; empty in a warm pool, where masters
-    follow one another."""
+    """Fingerprint of the only master that this agent may have; empty in a warm pool."""
+    pool: str = ""
+    """Public key of the warm pool, in hexadecimal digits; empty in a pool with one master."""
+    signature: str = ""
+    """Signature of the warm pool for the name, the uid and the public key of this agent."""
     epoch: int = 0
     """Lowest epoch of a master that this agent serves: that of the latest one when its pod was
     made, or of the latest one that it has served."""
@@ -91,8 +102,40 @@ class Credentials:
             str(values["uid"]),
             identity.check_key(values["key"]),
             str(values.get("master", "")),
+            str(values.get("pool", "")),
+            str(values.get("signature", "")),
             int(values.get("epoch", 0)),
         )
+
+    def prove(self, said: bytes) -> bytes:
+        """Return the proof that this agent has said ``said``."""
+        if not self.pool:
+            return _hmac(self.key, said)
+        signer = signatures.Signer(self.key)
+        return signer.public_key + bytes.fromhex(self.signature) + signer.sign(said)
+
+    def epoch_of_master(self, said: bytes, certificate: bytes, proof: bytes) -> int | None:
+        """Return the epoch of the master that has said ``said``; None if its proof is not valid.
+
+        ``certificate`` is the SHA-256 of the one that the master has shown.  TLS proves that the
+        master is its owner.
+        """
+        if not self.pool:
+            return self.epoch if hmac.compare_digest(proof, _hmac(self.key, said)) else None
+        epoch, signature = int.from_bytes(proof[:_EPOCH_SIZE], "big"), proof[_EPOCH_SIZE:]
+        statement = signatures.master_statement(epoch, certificate)
+        is_valid = signatures.is_signed(bytes.fromhex(self.pool), statement, signature)
+        return epoch if is_valid else None
+
+
+_EPOCH_SIZE = 8
+_KEY_END = signatures.PUBLIC_KEY_SIZE
+_POOL_SIGNATURE_END = _KEY_END + signatures.SIGNATURE_SIZE
+_AGENT_PROOF_SIZE = _POOL_SIGNATURE_END + signatures.SIGNATURE_SIZE
+
+
+def _hmac(key: str, said: bytes) -> bytes:
+    return hmac.digest(bytes.fromhex(key), said, "sha256")
 
 
 @dataclass(frozen=True)
@@ -110,39 +153,93 @@ class Certificate:
         return hashlib.sha256(ssl.PEM_cert_to_DER_cert(self.text)).digest()
 
 
+class MasterCredentials(Protocol):
+    """Credentials of a master for the agents of one pool."""
+
+    @property
+    def certificate(self) -> Certificate:
+        """Certificate that the master shows all agents."""
+
+    @property
+    def complete(self) -> bool:
+        """True if the master can prove itself."""
+
+    def believes(self, name: str, uid: str, said: bytes, proof: bytes) -> bool:
+        """Return True if the agent ``name`` with ``uid`` has said ``said``."""
+
+    def prove(self, name: str, uid: str, said: bytes) -> bytes:
+        """Return the proof to that agent that this master has said ``said``."""
+
+
 @dataclass(frozen=True)
-class MasterCredentials:
-    """Key of a pool, and the certificate of its master."""
+class OwnCredentials:
+    """Credentials of the only master that a pool ever has."""
 
     pool_key: str = field(repr=False)
     certificate: Certificate = field(repr=False)
-    only: bool = True
-    """True if the pool never has another master.  Then its agents know the fingerprint."""
+    complete = True
 
     @property
     def fingerprint(self) -> str:
-        """Hash that agents compare the certificate with; empty if another master may follow."""
-        return self.certificate.hash.hex() if self.only else ""
-
-    def agent_key(self, name: str, uid: str) -> str:
-        """Derive the key of an agent."""
-        return identity.agent_key(self.pool_key, name, uid)
+        """Hash that agents compare the certificate with."""
+        return self.certificate.hash.hex()
 
     def agent(self, name: str, uid: str) -> Credentials:
         """Return the credentials of an agent, which prove no other agent."""
-        return Credentials(name, uid, self.agent_key(name, uid), self.fingerprint)
+        key = identity.agent_key(self.pool_key, name, uid)
+        return Credentials(name, uid, key, self.fingerprint)
+
+    def believes(self, name: str, uid: str, said: bytes, proof: bytes) -> bool:
+        """Return True if the agent ``name`` with ``uid`` has said ``said``."""
+        return hmac.compare_digest(proof, self.prove(name, uid, said))
+
+    def prove(self, name: str, uid: str, said: bytes) -> bytes:
+        """Return the proof to that agent that this master has said ``said``."""
+        return _hmac(identity.agent_key(self.pool_key, name, uid), said)
 
 
-def make_credentials(
-    pool_key: str | None = None, certificate: Certificate | None = None
-) -> MasterCredentials:
-    """Return the credentials of a pool's master.
+class WarmCredentials:
+    """Credentials of one of the masters of a warm pool.
 
-    A pool without a key gets a new one. A master without a certificate gets a new one too.
+    ``public_key`` is the pool's.  The credentials are complete once the operator has signed.
     """
-    return MasterCredentials(
-        pool_key or identity.new_key(), certificate or make_certificate(), only=pool_key is None
-    )
+
+    def __init__(self, public_key: bytes, certificate: Certificate) -> None:
+        self.certificate = certificate
+        self._public_key = public_key
+        self._proof = b""
+
+    @property
+    def complete(self) -> bool:
+        """True once the operator has signed the certificate."""
+        return bool(self._proof)
+
+    def take_signature(self, epoch: int, signature: bytes) -> bool:
+        """Take the operator's signature for this master; return False if it is not valid."""
+        statement = signatures.master_statement(epoch, self.certificate.hash)
+        if not signatures.is_signed(self._public_key, statement, signature):
+            return False
+        self._proof = epoch.to_bytes(_EPOCH_SIZE, "big") + signature
+        return True
+
+    def believes(self, name: str, uid: str, said: bytes, proof: bytes) -> bool:
+        """Return True if the agent ``name`` with ``uid`` has said ``said``."""
+        if len(proof) != _AGENT_PROOF_SIZE:
+            return False
+        key, pool_signature = proof[:_KEY_END], proof[_KEY_END:_POOL_SIGNATURE_END]
+        statement = signatures.agent_statement(name, uid, key)
+        return signatures.is_signed(
+            self._public_key, statement, pool_signature
+        ) and signatures.is_signed(key, said, proof[_POOL_SIGNATURE_END:])
+
+    def prove(self, name: str, uid: str, said: bytes) -> bytes:
+        """Return the operator's signature, which serves for all agents."""
+        return self._proof
+
+
+def make_credentials(certificate: Certificate | None = None) -> OwnCredentials:
+    """Return the credentials of a new pool's master; without ``certificate`` it gets a new one."""
+    return OwnCredentials(identity.new_key(), certificate or make_certificate())
 
 
 def make_certificate() -> Certificate:

@@ -1,7 +1,7 @@
 """The file with an agent's credentials: a pod's first init container writes it for the agent.
 
-Only the init container mounts the pool's key.  It derives the agent's key, writes it to a volume in
-memory, and ends.  It imports the standard library alone, because each pod waits for it.
+Only the init container mounts the pool's key.  It makes the agent's key, writes it to a volume in
+memory, and ends.  Each pod waits for it, so it imports little: cryptography only in a warm pool.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
-from fiber_api import identity, names
+from fiber_api import identity, names, signatures
 
 
 def write(environment: Mapping[str, str]) -> int:
@@ -22,13 +22,11 @@ def write(environment: Mapping[str, str]) -> int:
         name, uid = environment[names.ENV_NAME], environment[names.ENV_UID]
         key = identity.check_key((folder / names.KEY_POOL).read_text())
         pin = folder / names.KEY_MASTER
-        values = {
-            "name": name,
-            "uid": uid,
-            "key": identity.agent_key(key, name, uid),
-            "master": pin.read_text().strip() if pin.exists() else "",
-            "epoch": int(environment.get(names.ENV_EPOCH, 0)),
-        }
+        values = {"name": name, "uid": uid, "epoch": int(environment.get(names.ENV_EPOCH, 0))}
+        if pin.exists():
+            values |= {"key": identity.agent_key(key, name, uid), "master": pin.read_text().strip()}
+        else:
+            values |= _signed(key, name, uid)
         _write(environment[names.ENV_CREDENTIALS], json.dumps(values).encode())
         _link_interpreter(Path(environment[names.ENV_CREDENTIALS]).parent)
     except KeyError as error:
@@ -36,6 +34,14 @@ def write(environment: Mapping[str, str]) -> int:
     except (OSError, ValueError) as error:
         return _fail(str(error))
     return 0
+
+
+def _signed(pool_key: str, name: str, uid: str) -> dict[str, str]:
+    """Return a new secret for the agent, and the pool's signature for its public key."""
+    pool, secret = signatures.pool_signer(pool_key), identity.new_key()
+    statement = signatures.agent_statement(name, uid, signatures.Signer(secret).public_key)
+    signature = pool.sign(statement).hex()
+    return {"key": secret, "pool": pool.public_key.hex(), "signature": signature}
 
 
 def take(path: str) -> bytes:

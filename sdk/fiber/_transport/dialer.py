@@ -157,18 +157,21 @@ class AgentDialer:
         until = since + seconds * random.uniform(0.5, 1.0)
         return self._over.wait(max(until - time.monotonic(), 0.0))
 
-    def _exchange_greetings(self, hello: bytes) -> tuple[bytes, int, Secrets]:
-        """Connect and exchange greetings; return the answer and the connection without TLS."""
+    def _exchange_greetings(self, hello: bytes) -> tuple[bytes, int, int, Secrets]:
+        """Connect and exchange greetings.
+
+        Return the master's answer and epoch, and the connection without TLS.
+        """
         sock = self._connect(self._address)
         tls_handshake = authentication.AgentHandshake(sock, self._context)
         try:
             with self._lock:
                 self._sock = tls_handshake.sock
             deadline = time.monotonic() + _GREET
-            answer = self._finish(
+            answer, epoch = self._finish(
                 tls_handshake, tls_handshake.ask(self._credentials, hello), deadline
             )
-            return answer, *self._finish(tls_handshake, tls_handshake.end(), deadline)
+            return answer, epoch, *self._finish(tls_handshake, tls_handshake.end(), deadline)
         finally:
             with self._lock:
                 self._sock = None
@@ -193,20 +196,27 @@ class AgentDialer:
 
     # On the loop thread
 
-    def _answered(self, answer: bytes, descriptor: int, secrets: Secrets) -> None:
+    def _answered(self, answer: bytes, epoch: int, descriptor: int, secrets: Secrets) -> None:
         if self._over.is_set():
             os.close(descriptor)
             return
         try:
-            welcome = self._check_answer(answer)
+            welcome = self._check_answer(answer, epoch)
         except (FiberError, AuthenticationError) as error:
             os.close(descriptor)
             self._fail(error)
         else:
+            self.epoch = epoch
             self._welcomed(welcome, descriptor, secrets)
 
-    def _check_answer(self, answer: bytes) -> MasterWelcome:
+    def _check_answer(self, answer: bytes, epoch: int) -> MasterWelcome:
         """Return the welcome in the answer of the master; raise an error if it is a refusal."""
+        if epoch < self.epoch:
+            raise EarlierMaster(
+                f"the master at {self._address} has epoch {epoch}, and this agent belongs to a "
+                f"later one, of epoch {self.epoch}: another program has taken the pool. End the "
+                "earlier program"
+            )
         try:
             greeting = authentication.decode_greeting(answer)
         except ProtocolError as error:
@@ -215,12 +225,6 @@ class AgentDialer:
         if mismatch is not None:
             raise fresh(mismatch)
         if isinstance(greeting, MasterWelcome):
-            if greeting.epoch < self.epoch:
-                raise EarlierMaster(
-                    f"the master at {self._address} has epoch {greeting.epoch}, and this agent "
-                    f"belongs to a later one, of epoch {self.epoch}: another program has taken the "
-                    "pool. End the earlier program"
-                )
             return greeting
         reason = greeting.reason if isinstance(greeting, MasterRefusal) else "it is an agent itself"
         raise LinkError(f"the master at {self._address} refused this agent: {reason}")
@@ -241,7 +245,7 @@ class AgentDialer:
             self._obstacle = str(error)
             self._start(_PAUSE_MAX)
             return
-        self.lost_grace, self.epoch = welcome.lost_grace, welcome.epoch
+        self.lost_grace = welcome.lost_grace
         link.connected(connection, welcome.arrived)
         if self._link is None:
             self._cancel_deadline()

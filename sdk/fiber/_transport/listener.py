@@ -60,8 +60,7 @@ class MasterListener:
         self._on_proven = on_proven
         self._on_unserved = on_unserved
         self._knows = objection
-        self.epoch = 0
-        """Number of this master among the masters of the pool."""
+        self._credentials = credentials
         self._waiting: dict[tuple[str, str], tuple[PendingConnection, AgentHello]] = {}
         self._by_peer: dict[tuple[str, str], Link] = {}
         self._keepalive = keepalive
@@ -78,10 +77,6 @@ class MasterListener:
             on_refused=lambda reason: loop.call_soon(on_refused, reason),
         )
         self._acceptor.add(self._served)
-
-    def take_epoch(self, epoch: int) -> None:
-        """Tell agents from now on that this master has this epoch.  Any thread."""
-        self.epoch = epoch
 
     def take(self, sock: socket.socket, origin: str) -> None:
         """Serve a connection to an agent that did not come through ``address``."""
@@ -144,19 +139,23 @@ class MasterListener:
 
     def _greet(self, pending: PendingConnection, hello: AgentHello) -> None:
         """Answer an agent that has proved its name and uid."""
+        if not self._credentials.complete:
+            what = "the operator has not signed this program's certificate yet"
+            self._let_wait(pending, hello, what)
+            return
         reason = self._objection(hello)
         if reason is None:
-            self._let_wait(pending, hello)
+            self._let_wait(pending, hello, f"there is no pod {hello.identity.name!r} yet")
         elif reason:
             self._refuse(pending, reason)
         else:
             self._welcome(pending, hello)
 
-    def _let_wait(self, pending: PendingConnection, hello: AgentHello) -> None:
+    def _let_wait(self, pending: PendingConnection, hello: AgentHello, why: str) -> None:
         peer = _peer(hello.identity)
         if before := self._waiting.pop(peer, None):
             before[0].drop()  # the same agent has dialled again
-        pending.waits_for(f"there is no pod {hello.identity.name!r} yet")
+        pending.waits_for(why)
         self._waiting[peer] = pending, hello
 
     def _objection(self, hello: AgentHello) -> str | None:
@@ -190,9 +189,7 @@ class MasterListener:
             # The welcome says how much has arrived, so the old connection must bring no more.
             link.disconnect()
         arrived = link.arrived if link else 0
-        welcome = MasterWelcome(
-            self._identity, arrived, *self._keepalive, self._lost_grace, self.epoch
-        )
+        welcome = MasterWelcome(self._identity, arrived, *self._keepalive, self._lost_grace)
         pending.welcome(
             welcome.encode(),
             lambda descriptor, secrets: self._loop.call_soon(

@@ -19,7 +19,7 @@ from fiber._wire.memory_files import BytesLike
 from fiber._wire.packet import ALIGNMENT, INLINE_LIMIT
 from fiber.errors import FiberError
 
-PROTOCOL = 2
+PROTOCOL = 3
 """Version of the frames of this module and of all that they carry: the messages of ``work.py`` and
 ``hub.protocol``, and pickles of Fiber's classes.  Raise it when one of these changes."""
 

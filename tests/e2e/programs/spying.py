@@ -25,7 +25,7 @@ from typing import TypeVar
 
 import fiber
 from fiber._transport.authentication import Identity
-from fiber._transport.credentials import MasterCredentials
+from fiber._transport.credentials import OwnCredentials
 
 T = TypeVar("T")
 DISGUISE = bytes(byte ^ 0x5A for byte in range(256))
@@ -43,8 +43,8 @@ def main() -> None:
             hosts |= set(pool.map(host, range(8), chunksize=1))
         identities = [found for found in _all(Identity) if found.name in hosts and found.uid]
         uids = {found.name: found.uid for found in identities}
-        (credentials,) = _all(MasterCredentials)
-        keys = {name: credentials.agent_key(name, uid) for name, uid in uids.items()}
+        (credentials,) = _all(OwnCredentials)
+        keys = {name: credentials.agent(name, uid).key for name, uid in uids.items()}
         sought = {CANARY: secrets.token_hex(32), "the pool": credentials.pool_key, **keys}
         disguised = {
             f"{whose}, {form}": word.translate(DISGUISE)

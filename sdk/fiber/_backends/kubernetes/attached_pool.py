@@ -19,10 +19,9 @@ from typing import Any
 from fiber import _logs
 from fiber._backends.kubernetes.api import TIMEOUT, Api
 from fiber._exceptions import fresh
-from fiber._transport.credentials import MasterCredentials
+from fiber._transport.credentials import OwnCredentials
 from fiber.errors import FiberPoolError
-from fiber_api import identity, names
-from fiber_api.identity import InvalidKey
+from fiber_api import names
 from fiber_api.names import ConditionType
 from fiber_api.rest import (
     LEASES,
@@ -50,6 +49,8 @@ class PoolMaster:
     port: int
     identity: str
     """Unique name of the program, also shown to users."""
+    certificate: str = ""
+    """SHA-256 of the certificate that the program shows the agents, in hexadecimal digits."""
     lease_duration: int = 30
     lost_grace: int = 60
 
@@ -65,6 +66,7 @@ class PoolMaster:
             "port": self.port,
             "epoch": epoch,
             "identity": self.identity,
+            **({"certificate": self.certificate} if self.certificate else {}),
             "leaseName": names.master_lease_name(pool),
             "leaseDurationSeconds": self.lease_duration,
             "lostGraceSeconds": self.lost_grace,
@@ -258,7 +260,7 @@ def _micro_time() -> str:
 
 
 def secret_body(
-    name: str, credentials: MasterCredentials, owner: Body, labels: dict[str, str]
+    name: str, credentials: OwnCredentials, owner: Body, labels: dict[str, str]
 ) -> Body:
     """Return the Secret that the init containers of pods mount.
 
@@ -278,11 +280,6 @@ def secret_body(
     }
 
 
-def pool_key_of(secret: Body) -> str:
-    """Return the key in a Secret that the operator made; InvalidKey if it cannot serve."""
-    return identity.key_in(secret.get("data") or {})
-
-
 _NAME_BYTES = names.SECRET_SUFFIX_LENGTH // 2
 """Random bytes in the name of a Secret that replaces another one."""
 _EPOCH = 1
@@ -300,7 +297,7 @@ class OwnPool:
         api: Api,
         namespace: str,
         body: Body,
-        credentials: MasterCredentials,
+        credentials: OwnCredentials,
         master: PoolMaster,
         owner: Body | None,
     ) -> None:
@@ -414,36 +411,6 @@ _PAUSE = 0.05
 """Seconds until the next attempt, after another client has changed the pool."""
 
 
-def read_pool_key(
-    api: Api, namespace: str, pool: str, spec: Body, cancel: threading.Event | None = None
-) -> str:
-    """Read the key of the pool with this ``spec`` from its Secret.  Blocks; ``ApiError``,
-    FiberPoolError.
-    """
-    name = spec.get("credentialsSecretName") or names.secret_name(pool)
-    what = f"the Secret {name!r} of the FiberPool {pool!r} in namespace {namespace!r}"
-    try:
-        secret = api.get(SECRETS.path(namespace, name), cancel=cancel)
-        return pool_key_of(secret)
-    except InvalidKey as error:
-        raise FiberPoolError(
-            f"{what} cannot be used: {error}. If the operator made it, delete it, and the operator "
-            "makes a new one. Then delete the pool's pods, which have the old one",
-            pool=pool,
-            namespace=namespace,
-            reason=names.Reason.INVALID_CREDENTIALS,
-        ) from None
-    except Forbidden as error:
-        raise FiberPoolError(
-            f"cannot read {what}, whose credentials its master needs: {error.message}. The role "
-            f"fiber-user reads no Secret; give this one: `kubectl create role NAME -n {namespace} "
-            f"--verb=get --resource=secrets --resource-name={name}`, and bind it",
-            pool=pool,
-            namespace=namespace,
-            reason=names.Reason.FORBIDDEN,
-        ) from None
-
-
 class WarmPool:
     """FiberPool of another owner, which this program attaches to and detaches from."""
 
@@ -453,12 +420,9 @@ class WarmPool:
         namespace: str,
         name: str,
         master: PoolMaster,
-        on_epoch: Callable[[int], None],
     ) -> None:
-        """``on_epoch`` gets this master's epoch before the pool's agents can dial it."""
         self._api = api
         self._master = master
-        self._on_epoch = on_epoch
         self._attached: AttachedPool | None = None
         self._replicas = 0
         """Replicas of the pool before, which ``detach`` restores."""
@@ -538,7 +502,6 @@ class WarmPool:
         return True
 
     def _as_master(self, found: Body, epoch: int) -> AttachedPool:
-        self._on_epoch(epoch)
         return AttachedPool(self._api, found, self._master, epoch, kept_by_others=True)
 
     def _check_lost(self, found: Body, there: Body) -> None:

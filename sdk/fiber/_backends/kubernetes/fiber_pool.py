@@ -72,7 +72,7 @@ class PoolObserver(Protocol):
     def connected(self) -> int:
         """Return how many agents are linked; called on any thread."""
 
-    def on_attached(self, epoch: int) -> None:
+    def on_attached(self) -> None:
         """Note that the pool exists, with this program as its master.  Called once."""
 
     def on_status(self, status: Body) -> None:
@@ -227,7 +227,7 @@ class FiberPoolClient:
             on_fault=self._reporter.fault,
         )
         self._followers = [renewer, pool, pods]
-        self._loop.call_soon(self._observer.on_attached, attached.epoch)
+        self._loop.call_soon(self._observer.on_attached)
         for follower in self._followers:
             follower.start()
         return attached

@@ -16,12 +16,13 @@ import secrets
 import socket
 import sys
 import threading
+import time
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any, NamedTuple, Protocol
 
 from fiber._backends.kubernetes.api import Api
-from fiber._backends.kubernetes.attached_pool import OwnPool, PoolMaster, WarmPool, read_pool_key
-from fiber._backends.kubernetes.fiber_pool import AttachablePool
+from fiber._backends.kubernetes.attached_pool import OwnPool, PoolMaster, WarmPool
+from fiber._backends.kubernetes.fiber_pool import OPERATOR_ABSENT, AttachablePool
 from fiber._backends.kubernetes.problems import explain
 from fiber._backends.kubernetes.template import (
     PodShape,
@@ -34,7 +35,13 @@ from fiber._backends.kubernetes.template import (
 )
 from fiber._transport.acceptor import Acceptor
 from fiber._transport.authentication import Identity
-from fiber._transport.credentials import MasterCredentials, make_certificate, make_credentials
+from fiber._transport.credentials import (
+    Certificate,
+    MasterCredentials,
+    WarmCredentials,
+    make_certificate,
+    make_credentials,
+)
 from fiber._transport.link import Keepalive, Link
 from fiber._transport.listener import MasterListener
 from fiber._transport.loop import Loop
@@ -44,6 +51,9 @@ from fiber_api import names
 from fiber_api.rest import CLAIMS, NODES, PODS, POOLS, ApiError, Body, Forbidden, NotFound
 
 _SUFFIX_BYTES = 4
+
+_LOOK_AGAIN = 0.2
+"""Seconds until the next look at a pool that no operator has seen yet."""
 
 _LONGEST_HOST_NAME = 63
 """Characters of a host name that Kubernetes gives a pod, at most."""
@@ -78,6 +88,8 @@ class PreparedPool(NamedTuple):
     """Smallest number of pods."""
     max_pods: int
     """Largest number of pods."""
+    unsigned: WarmCredentials | None = None
+    """Credentials that the operator has to sign; None if the pool is this program's own."""
 
 
 class PoolProvisioner:
@@ -136,14 +148,13 @@ class PoolProvisioner:
     ) -> PreparedPool:
         """Prepare to attach to a pool of another owner."""
         try:
-            path = POOLS.path(self.namespace, name)
-            spec = self._api.get(path, cancel=cancel)["spec"]
-            key = read_pool_key(self._api, self.namespace, name, spec, cancel)
+            found = self._seen_by_operator(name, cancel)
         except ApiError as error:
             raise self._explained(error, f"attach to the FiberPool {name!r}", name) from error
-        credentials = make_credentials(key, self._certificate)
+        spec, public_key = found["spec"], bytes.fromhex(found["status"]["publicKey"])
+        credentials = WarmCredentials(public_key, self._certificate)
         master, listener = self._listen(name, credentials, loop, observer)
-        attachment = WarmPool(self._api, self.namespace, name, master, listener.take_epoch)
+        attachment = WarmPool(self._api, self.namespace, name, master)
         return PreparedPool(
             listener,
             master.address,
@@ -151,6 +162,35 @@ class PoolProvisioner:
             int(spec.get("processesPerPod", 1)),
             int(spec.get("minReplicas", 0)),
             int(spec.get("maxReplicas", self._config.max_pods)),
+            credentials,
+        )
+
+    def _seen_by_operator(self, name: str, cancel: threading.Event) -> Body:
+        """Return the pool once the operator has told its public key."""
+        deadline = time.monotonic() + OPERATOR_ABSENT
+        while True:
+            found = self._api.get(POOLS.path(self.namespace, name), cancel=cancel)
+            status = found.get("status") or {}
+            if status.get("publicKey"):
+                return found
+            if time.monotonic() > deadline or cancel.wait(_LOOK_AGAIN):
+                raise self._without_key(name, status)
+
+    def _without_key(self, name: str, status: Body) -> FiberPoolError:
+        problems = [str(problem.get("message")) for problem in status.get("problems") or ()]
+        why = (
+            f"The pool's status says: {problems[0]}"
+            if problems
+            else "Check that an operator runs and serves this namespace, and that it is not older "
+            "than this program"
+        )
+        return FiberPoolError(
+            f"the FiberPool {name!r} in namespace {self.namespace!r} has no public key in its "
+            f"status, by which this program would know its agents, after {OPERATOR_ABSENT:g} s. "
+            f"{why}",
+            pool=name,
+            namespace=self.namespace,
+            reason="NoOperator",
         )
 
     def _listen(
@@ -169,7 +209,7 @@ class PoolProvisioner:
             keepalive=Keepalive(config.heartbeat_interval, config.suspect_after, config.lost_after),
             lost_grace=PoolMaster.lost_grace,
         )
-        return self._master(host, listener), listener
+        return self._master(host, listener, credentials.certificate), listener
 
     def _acceptor_at(self, host: str) -> Acceptor:
         with self._lock:
@@ -188,10 +228,11 @@ class PoolProvisioner:
         found = reachable_address(self._api, listen, pool=pool, namespace=self.namespace)
         return listen or found, advertised or found
 
-    def _master(self, host: str, listener: MasterListener) -> PoolMaster:
+    def _master(self, host: str, listener: MasterListener, certificate: Certificate) -> PoolMaster:
         port = int(listener.address.rpartition(":")[2])
         # The suffix tells this program from an earlier one with the same pid.
-        return PoolMaster(host, port, f"{socket.gethostname()}:{os.getpid()}:{self._suffix}")
+        identity = f"{socket.gethostname()}:{os.getpid()}:{self._suffix}"
+        return PoolMaster(host, port, identity, certificate.hash.hex())
 
     def _find_own_pod(self, cancel: threading.Event) -> Body | None:
         """Return the pod that this program runs in; None outside of pods."""
