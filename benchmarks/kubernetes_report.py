@@ -93,14 +93,19 @@ def page(runs: Mapping[str, Run], *, notes: bool = False) -> str:
     ]
     for name, run in runs.items():
         mine = [case for case in of_all if case.measure == name]
-        parts += _section(MEASURES[name], run, mine)
+        apart = run.about["date"] != first.about["date"]
+        parts += _section(MEASURES[name], run, mine, apart=apart)
     return "\n\n".join([*parts, f"## Made on\n\n{origin(first.about)}"]) + "\n"
 
 
-def _section(measure: ModuleType, run: Run, of_measure: Sequence[Case]) -> list[str]:
+def _section(
+    measure: ModuleType, run: Run, of_measure: Sequence[Case], *, apart: bool
+) -> list[str]:
+    """Return a measure's part of the page; ``apart`` if another command measured it."""
     groups = {
         case.group: [each for each in of_measure if each.group == case.group] for case in of_measure
     }
     tables = [group_table(run, members) for members in groups.values()]
     missing = failures(run).replace("## Not measured", "Not measured:")
-    return [f"## {measure.TITLE}", measure.ABOUT, *tables, *filter(None, [missing])]
+    about = [reading(run, of_measure), origin(run.about)] if apart else []
+    return [f"## {measure.TITLE}", measure.ABOUT, *about, *tables, *filter(None, [missing])]

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from benchmarks import budgets, kubernetes_report, machine, processes
+from benchmarks import budgets, kubernetes_report, machine, processes, report
 from benchmarks.contenders import (
     BY_NAME,
     EXECUTOR,
@@ -47,17 +47,19 @@ def main(arguments: Sequence[str]) -> int:
     able = [each for each in CONTENDERS if each.name not in skipped]
     command = shlex.join(["python", "-m", "benchmarks.kubernetes_run", *arguments])
     about = {**machine.about(able, command, options.rounds, options.size), "skipped": skipped}
-    runs = {name: Run(dict(about)) for name in kubernetes_report.MEASURES}
+    new = {name: Run(dict(about)) for name in options.measure}
     try:
-        _measure(runs, able, options)
+        _measure(new, able, options)
     except KeyboardInterrupt:
         return 130
+    runs = {**report.load(options.output, kubernetes_report.RESULTS), **new}
+    runs = {name: runs[name] for name in kubernetes_report.MEASURES if name in runs}
     kubernetes_report.write(options.output, runs)
     for verdict in budgets.verdicts(runs, budgets.ON_PODS):
         budget = f"{verdict.budget.what}: {verdict.measured}, {verdict.budget.in_words()}"
         say(f"{budget}: {verdict.verdict}")
     say(f"written to {options.output}")
-    failed = {name for run in runs.values() for those in run.failures.values() for name in those}
+    failed = {name for run in new.values() for those in run.failures.values() for name in those}
     return int(any(each.name in failed | set(skipped) for each in _OURS))
 
 
@@ -67,7 +69,9 @@ def _measure(runs: dict[str, Run], able: list[Contender], options: argparse.Name
     with scratch_folder() as scratch:
         rounds = Rounds(scratch, runs)
         try:
-            rounds.play(kubernetes_report.cases(options.size), able, options.rounds)
+            cases = kubernetes_report.cases(options.size)
+            mine = [case for case in cases if case.measure in runs]
+            rounds.play(mine, able, options.rounds)
         except KeyboardInterrupt:
             signal.signal(signal.SIGINT, signal.SIG_IGN)
             say("interrupted: stopping the contenders; no page is written")
@@ -79,6 +83,15 @@ def _measure(runs: dict[str, Run], able: list[Contender], options: argparse.Name
 def _parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         "benchmarks.kubernetes_run", description="Measure Fiber on pods beside others on processes."
+    )
+    parser.add_argument(
+        "--measure",
+        nargs="+",
+        choices=list(kubernetes_report.MEASURES),
+        default=list(kubernetes_report.MEASURES),
+        metavar="NAME",
+        help=f"any of {', '.join(kubernetes_report.MEASURES)}; default: all. The page keeps the "
+        "earlier figures of the others, so it must have been written once",
     )
     parser.add_argument("--quick", action="store_true", help="small, once, to build/benchmarks")
     parser.add_argument("--rounds", type=int, help="default 5; 1 with --quick")

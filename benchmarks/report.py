@@ -26,10 +26,10 @@ _GENERATED = (
 )
 
 
-def load(folder: Path) -> dict[str, Run]:
+def load(folder: Path, results: str = RESULTS) -> dict[str, Run]:
     """Return the runs of an earlier report, by measure, so that one measure can be run again
     alone."""
-    path = folder / RESULTS
+    path = folder / results
     if not path.exists():
         return {}
     return {

@@ -363,6 +363,17 @@ def test_the_page_of_pods_has_all_measures_and_their_budgets(pods: float, kept: 
     assert f"overhead: 1 ms tasks, chunksize 1 | multiprocessing, fork | ≤ 1.02x | {pods}" in page
     assert kubernetes_report.NOTES not in page
     assert kubernetes_report.NOTES in kubernetes_report.page(runs, notes=True)
+    assert page.count("| command |") == 1
+
+
+def test_a_measure_of_pods_that_was_run_alone_says_so() -> None:
+    runs = runs_on_pods(1.0)
+    about = {**ABOUT, "date": "2026-02-03", "command": "python -m benchmarks.kubernetes_run later"}
+    runs["latency"].about.update(about)
+    _, section = kubernetes_report.page(runs).split("## Latency")
+    section, *others = section.split("\n## ")
+    assert "| command | `python -m benchmarks.kubernetes_run later` |" in section
+    assert sum("| command |" in other for other in others) == 1
 
 
 def test_no_cluster_is_started_if_another_is_named(

@@ -18,9 +18,10 @@ from fiber._backends.kubernetes.provisioner import PoolProvisioner, VolumeClaims
 from fiber._backends.kubernetes.template import PodShape
 from fiber._transport.loop import Loop
 from fiber.config import Config
-from fiber.errors import ConfigError
+from fiber.errors import ConfigError, FiberPoolError
+from fiber_api import names
 from patience import PATIENCE
-from unit.kubernetes_rig import NAMESPACE, Rig, rig
+from unit.kubernetes_rig import NAMESPACE, Rig, pool_body, rig
 
 
 @pytest.fixture(name="rig")
@@ -114,3 +115,55 @@ def test_a_claim_of_the_template_is_not_reported(rig: Rig) -> None:
     claims = VolumeClaims(("one-claim",))
     assert claims.warnings(POD) == []
     assert len(claims.warnings(without_claims(POD, claims.one_node))) == 1
+
+
+# -- A warm pool, whose agents it knows by the public key in the status
+
+
+@pytest.fixture
+def made(rig: Rig) -> Iterator[PoolProvisioner]:
+    rig.server.do(rig.server.store.create, names.PLURAL, NAMESPACE, pool_body("warm"))
+    made = PoolProvisioner(Config())
+    yield made
+    made.close()
+
+
+def tell(rig: Rig, **status: object) -> None:
+    rig.server.do(rig.server.store.set_status, names.PLURAL, NAMESPACE, "warm", status)
+
+
+def test_it_waits_until_the_operator_has_told_the_public_key(
+    rig: Rig, made: PoolProvisioner
+) -> None:
+    looks = iter(range(2))
+
+    def operator_looks(_: object) -> None:
+        if next(looks, None) is None:
+            rig.server.store.set_status(
+                names.PLURAL, NAMESPACE, "warm", {"publicKey": "ab", "masterEpoch": 3}
+            )
+
+    rig.server.api.after = operator_looks
+    found = made._seen_by_operator("warm", threading.Event())
+    assert found["status"]["publicKey"] == "ab"
+
+
+@pytest.mark.parametrize(
+    ("problems", "why"),
+    [
+        ([], "Check that an operator runs and serves this namespace"),
+        ([{"message": "the Secret mine has no valid key."}], "the Secret mine has no valid key"),
+    ],
+)
+def test_a_pool_without_a_public_key_is_named_with_the_reason(
+    rig: Rig,
+    made: PoolProvisioner,
+    monkeypatch: pytest.MonkeyPatch,
+    problems: list[dict[str, str]],
+    why: str,
+) -> None:
+    monkeypatch.setattr(provisioner, "OPERATOR_ABSENT", 0.0)
+    tell(rig, problems=problems)
+    with pytest.raises(FiberPoolError, match=why) as caught:
+        made._seen_by_operator("warm", threading.Event())
+    assert "'warm' in namespace 'lab' has no public key in its status" in str(caught.value)
