@@ -14,8 +14,8 @@ from fiber_api import identity, signatures
 class WarmKey:
     """Key of one warm pool, a new one unless ``key`` is given."""
 
-    def __init__(self, key: str | None = None) -> None:
-        self.signer = signatures.pool_signer(key or identity.new_key())
+    def __init__(self, key: str | None = None, uid: str = "pool") -> None:
+        self.signer = signatures.pool_signer(key or identity.new_key(), uid)
 
     def agent(self, name: str, uid: str, epoch: int = 0) -> Credentials:
         """Return the credentials of an agent that serves no master below ``epoch``."""
@@ -31,8 +31,11 @@ class WarmKey:
 
     def sign(self, credentials: WarmCredentials, epoch: int) -> bool:
         """Sign as the operator does; return what ``take_signature`` returns."""
-        statement = signatures.master_statement(epoch, credentials.certificate.hash)
-        return credentials.take_signature(epoch, self.signer.sign(statement))
+        return credentials.take_signature(epoch, self.signature(epoch, credentials.certificate))
+
+    def signature(self, epoch: int, certificate: Certificate) -> bytes:
+        """Return the operator's signature for the master of ``epoch``."""
+        return self.signer.sign(signatures.master_statement(epoch, certificate.hash))
 
     def master(self, epoch: int, certificate: Certificate | None = None) -> WarmCredentials:
         """Return the credentials of the master of ``epoch``."""

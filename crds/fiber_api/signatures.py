@@ -1,9 +1,9 @@
 """Signatures (Ed25519, RFC 8032) that tie the agents and the masters of a warm pool.
 
 Masters of such a pool follow one another, so no two of them may share a secret (decision 44). The
-pool has a key pair, which its key gives. Only the operator and each pod's init container can sign
-with it: the operator signs the certificate of each master, the init container the public key of its
-agent. Agents and masters know the public key alone.
+pool has a key pair, which its key and its uid give. Only the operator and each pod's init
+container can sign with it: the operator signs the certificate of each master, the init container
+the public key of its agent. Agents and masters know the public key alone.
 """
 
 from __future__ import annotations
@@ -28,9 +28,14 @@ class Signer:
         return self._key.sign(statement)
 
 
-def pool_signer(pool_key: str) -> Signer:
-    """Return the signer of the pool with this key."""
-    return Signer(hmac.new(bytes.fromhex(pool_key), b"fiber signer", "sha256").hexdigest())
+def pool_signer(pool_key: str, pool_uid: str) -> Signer:
+    """Return the signer of the FiberPool with this key and uid.
+
+    A Secret may outlive its pool, and the next pool with the Secret begins with the first epoch. So
+    each pool has its own key pair.
+    """
+    words = b"fiber signer " + pool_uid.encode()
+    return Signer(hmac.new(bytes.fromhex(pool_key), words, "sha256").hexdigest())
 
 
 def is_signed(public_key: bytes, statement: bytes, signature: bytes) -> bool:

@@ -123,7 +123,7 @@ class FiberPoolStatus(Model):
     idle_since: Time | None = None
     """Time since which the master has asked for no workers, if spec.idle is set."""
     credentials_secret: str | None = None
-    """Name of the Secret with the master's credentials, once it is complete."""
+    """Name of the Secret with the pool's key, once it is complete."""
     template_hash: str | None = None
     """Hash of the current template; the pods' label fiber.dev/template-hash."""
     proven_template_hash: str | None = None

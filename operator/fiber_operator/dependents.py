@@ -50,9 +50,9 @@ class Dependents:
     checked: float
     """Time of the last complete check."""
     credentials: bool
-    """True if the Secret belongs to the pool and has a valid key, or is the user's."""
+    """True if the Secret belongs to the pool, or is the user's, and has a valid key."""
     secret: PoolSecret | None = None
-    """The pool's Secret; None while there is none."""
+    """The pool's Secret; None if ``credentials`` is False."""
     budget: int | None = None
     """Value of the PodDisruptionBudget.  None: there is none.  0: not known."""
     failure: ApiError | None = None
@@ -127,7 +127,7 @@ class DependentsReconciler:
             (f"the EndpointSlice {names.endpoint_slice_name(name)}", self._slice)
         ]
         fresh = known is not None and self._now() - known.checked < CHECK_INTERVAL
-        complete = known is None or not fresh or bool(known.obstacles) or known.secret is None
+        complete = known is None or not fresh or bool(known.obstacles)
         if known is not None and not complete:
             if (known.master, known.budget) == (pool.spec.master, pool.spec.min_available):
                 return known
@@ -187,13 +187,10 @@ class DependentsReconciler:
             "which hold the old key"
         )
         made = seconds(text(mapping(existing, "metadata").get("creationTimestamp")))
-        return PoolSecret(made, _signer(existing, remedy))
+        return PoolSecret(made, _signer(pool, existing, remedy))
 
     async def _check_brought(self, pool: FiberPool, name: str) -> PoolSecret | None:
-        """Return the Secret; None while there is none.
-
-        Refuse one that belongs to another pool, or that an earlier pool names too.
-        """
+        """Return the Secret, unless it belongs to another pool, or an earlier pool names it too."""
         reserved = names.pool_of_secret(name)
         if reserved is None:
             self._check_users(pool, name)
@@ -202,17 +199,17 @@ class DependentsReconciler:
             raise _wrong_secret(name, why, reserved)
         try:
             existing = await self._cluster.read(SECRETS, pool.metadata.namespace, name)
-        except NotFound:  # the pods wait for it
-            return PoolSecret() if manifests.is_of_a_program(pool) else None
+        except NotFound:
+            if manifests.is_of_a_program(pool):
+                return PoolSecret()  # the program is about to make it
+            message = (
+                f"there is no Secret {name}, which spec.credentialsSecretName names. Make it, with "
+                f"{_KEY_ADVICE}."
+            )
+            raise _Obstructed(Obstacle(Reason.INVALID_CREDENTIALS, message)) from None
         if (other := manifests.other_owner(pool, existing)) is not None:
             raise _wrong_secret(name, f"which is the Secret of the FiberPool {other}", other)
-        if names.KEY_MASTER in mapping(existing, "data"):
-            return PoolSecret()
-        remedy = (
-            f"Put 64 random hexadecimal digits into the entry {names.KEY_POOL}: "
-            "`openssl rand -hex 32` prints some"
-        )
-        return PoolSecret(signer=_signer(existing, remedy))
+        return PoolSecret(signer=_signer(pool, existing, f"It needs {_KEY_ADVICE}"))
 
     def _check_users(self, pool: FiberPool, name: str) -> None:
         """Refuse a Secret that an earlier pool names too."""
@@ -314,10 +311,19 @@ class DependentsReconciler:
         return existing
 
 
-def _signer(secret: Body, remedy: str) -> signatures.Signer:
-    """Return the signer with the pool's key; ``remedy`` says what helps if there is no key."""
+_KEY_ADVICE = f"the output of `openssl rand -hex 32` in the entry {names.KEY_POOL}"
+
+
+def _signer(pool: FiberPool, secret: Body, remedy: str) -> signatures.Signer | None:
+    """Return the signer with the pool's key; None if the Secret names the pool's only master.
+
+    ``remedy`` says what helps if there is no key.
+    """
+    data = mapping(secret, "data")
+    if names.KEY_MASTER in data:
+        return None
     try:
-        return signatures.pool_signer(identity.key_in(mapping(secret, "data")))
+        return signatures.pool_signer(identity.key_in(data), pool.metadata.uid)
     except identity.InvalidKey as error:
         name = text(mapping(secret, "metadata").get("name"))
         message = f"the Secret {name} has no valid key: {error}. {remedy}."
@@ -368,9 +374,9 @@ def _has_ports(spec: Mapping[str, Any], ports: list[Body]) -> bool:
 
 def _wrong_secret(name: str, why: str, other: str) -> _Obstructed:
     message = (
-        f"spec.credentialsSecretName is {name}, {why}. The workers could pose as those of {other}. "
-        "Leave credentialsSecretName out, so that the operator makes a Secret, or name one that "
-        "belongs to no other pool. The field cannot be changed, so make the pool anew."
+        f"spec.credentialsSecretName is {name}, {why}. Whoever reads it could pose as a program of "
+        f"{other}. Leave credentialsSecretName out, so that the operator makes a Secret, or name "
+        "one that belongs to no other pool. The field cannot be changed, so make the pool anew."
     )
     return _Obstructed(Obstacle(Reason.INVALID_CREDENTIALS, message, True))
 

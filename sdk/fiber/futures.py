@@ -224,7 +224,7 @@ class Executor(concurrent.futures.Executor):
                 function=engine.function(fn),
                 future=results._buffer,
                 unit=unit,
-                exact=unit == 1,
+                eager=unit == 1,
                 timeout=self._timeout,
                 limits=self._limits,
             )

@@ -391,7 +391,7 @@ class Pool:
             function=function,
             future=future,
             unit=unit,
-            exact=chunksize == 1,
+            eager=chunksize == 1,
             timeout=limit,
         )
 

@@ -23,7 +23,7 @@ def test_a_pool_that_a_killed_interpreter_held_is_replaced(monkeypatch: pytest.M
             monkeypatch.setenv("KUBECONFIG", given["KUBECONFIG"])
             api = Api.connect()
             path = POOLS.path(given["FIBER_NAMESPACE"], given["FIBER_POOL"])
-            master = PoolMaster("10.0.0.7", 41337, "killed").spec(given["FIBER_POOL"], 1)
+            master = PoolMaster("10.0.0.7", 41337, "killed", "ab" * 32).spec(given["FIBER_POOL"], 1)
             api.merge_patch(path, {"spec": {"master": master}})
         with pools.lend() as other:
             assert other["FIBER_POOL"] != given["FIBER_POOL"]

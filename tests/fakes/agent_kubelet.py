@@ -147,6 +147,7 @@ class AgentKubelet:
             environment = {
                 names.ENV_KEY: key,
                 names.ENV_EPOCH: told[names.ENV_EPOCH],
+                names.ENV_POOL_UID: told[names.ENV_POOL_UID],
                 names.ENV_NAME: name,
                 names.ENV_UID: uid,
                 names.ENV_CREDENTIALS: str(folder / names.CREDENTIALS_FILE),

@@ -31,6 +31,7 @@ KINDS = {
 }
 WITH_STATUS = {"fiberpools", "pods"}
 EPOCH = datetime.datetime(2026, 1, 1, tzinfo=datetime.UTC)
+_GRACE = 30  # seconds that a pod has to end
 
 
 class Failure(Exception):
@@ -98,9 +99,9 @@ class Store:
     def version(self) -> str:
         return str(self._version)
 
-    def now(self) -> str:
-        """The time as Kubernetes writes it."""
-        moment = self.epoch + datetime.timedelta(seconds=self._clock())
+    def now(self, ahead: float = 0.0) -> str:
+        """The time as Kubernetes writes it, or that in so many seconds."""
+        moment = self.epoch + datetime.timedelta(seconds=self._clock() + ahead)
         return moment.isoformat(timespec="seconds").replace("+00:00", "Z")
 
     def unix_now(self) -> float:
@@ -186,7 +187,11 @@ class Store:
                 raise Failure(409, "Conflict", message)
         if plural == "pods" and self.pods_linger and options.get("gracePeriodSeconds") != 0:
             if "deletionTimestamp" not in current["metadata"]:
-                stamp = {"deletionTimestamp": self.now(), "deletionGracePeriodSeconds": 30}
+                # As in Kubernetes: the time at which the pod will be killed.
+                stamp = {
+                    "deletionTimestamp": self.now(_GRACE),
+                    "deletionGracePeriodSeconds": _GRACE,
+                }
                 self._put(
                     "MODIFIED", (plural, namespace, name), merged(current, {"metadata": stamp})
                 )

@@ -250,7 +250,7 @@ class ExecutorMaster:
             function=self._function(account),
             future=future,
             unit=plan.unit,
-            exact=self._rng.random() < 0.3,
+            eager=self._rng.random() < 0.3,
             timeout=plan.timeout,
         )
         return future.item

@@ -17,15 +17,17 @@ from fakes.served import Served, served
 from fiber._backends.kubernetes.api import Api
 from fiber._backends.kubernetes.attached_pool import OwnPool, PoolMaster, WarmPool
 from fiber._backends.kubernetes.fiber_pool import FiberPoolClient
-from fiber._transport.credentials import make_credentials
+from fiber._transport.credentials import make_certificate, make_credentials
 from fiber._transport.loop import Loop
 from fiber.errors import FiberPoolError
 from fiber_api import names
 from patience import PATIENCE
+from warm_key import WarmKey
 
 NAMESPACE = "lab"
-MASTER = PoolMaster("10.0.0.7", 41337, "laptop-7:4711")
-OTHER = PoolMaster("10.0.0.8", 41338, "laptop-8:4712")
+CERTIFICATE = make_certificate()
+MASTER = PoolMaster("10.0.0.7", 41337, "laptop-7:4711", CERTIFICATE.hash.hex())
+OTHER = PoolMaster("10.0.0.8", 41338, "laptop-8:4712", CERTIFICATE.hash.hex())
 Body = dict[str, Any]
 
 
@@ -121,6 +123,7 @@ class Operator:
     def __init__(self, server: Served) -> None:
         self._store = server.store
         self.mute = False
+        self.key = WarmKey()
         server.api.after = self._after
 
     def _after(self, call: Call) -> None:
@@ -131,8 +134,9 @@ class Operator:
     def _look(self, pool: Body) -> None:
         metadata = pool["metadata"]
         status = {**(pool.get("status") or {}), "observedGeneration": metadata["generation"]}
-        if "master" in pool["spec"]:
-            status["masterEpoch"] = pool["spec"]["master"]["epoch"]
+        if master := pool["spec"].get("master"):
+            status["masterEpoch"] = master["epoch"]
+            status["masterSignature"] = self.key.signature(master["epoch"], CERTIFICATE).hex()
         self._store.set_status(names.PLURAL, metadata["namespace"], metadata["name"], status)
 
 
@@ -160,7 +164,8 @@ class Rig:
 
     def warm(self, told: Told, master: PoolMaster = MASTER, name: str = "warm") -> FiberPoolClient:
         """A client that attaches to one."""
-        return self._client(WarmPool(self.api, NAMESPACE, name, master), told)
+        credentials = self.operator.key.unsigned(CERTIFICATE)
+        return self._client(WarmPool(self.api, NAMESPACE, name, master, credentials), told)
 
     def pool(self, name: str = "es-1") -> Body:
         """The pool as it is now."""

@@ -136,7 +136,15 @@ def test_a_descriptor_brings_them_once(credentials: OwnCredentials) -> None:
 
 
 def not_credentials() -> list[bytes]:
-    return [b"", b"secret", b"s\xff", b"[]", b"1", json.dumps({"key": "secret"}).encode()]
+    whole = {"name": "a", "uid": "1", "key": "ab" * 32}
+    documents = (
+        {"key": "secret"},
+        whole,
+        {**whole, "pool": "secret", "signature": "ab" * 64},
+        {**whole, "pool": "ab" * 32, "signature": "ab"},
+        {**whole, "pool": "ab" * 32, "signature": "ab" * 64, "master": "cd" * 32},
+    )
+    return [b"", b"secret", b"s\xff", b"[]", b"1", *(json.dumps(d).encode() for d in documents)]
 
 
 @pytest.mark.parametrize("value", not_credentials())

@@ -21,7 +21,7 @@ from fiber._backends.kubernetes import fiber_pool, informer
 from fiber_api import identity, names
 from fiber_api.rest import Forbidden
 from patience import PATIENCE
-from unit.kubernetes_rig import MASTER, NAMESPACE, OTHER, Body, Rig, Told
+from unit.kubernetes_rig import CERTIFICATE, MASTER, NAMESPACE, OTHER, Body, Rig, Told
 from unit.kubernetes_rig import rig as make_rig
 
 
@@ -76,6 +76,7 @@ def test_a_pool_is_born_with_its_master_and_without_pods(rig: Rig, told: Told) -
         "port": 41337,
         "epoch": 1,
         "identity": "laptop-7:4711",
+        "certificate": CERTIFICATE.hash.hex(),
         "leaseName": names.master_lease_name("es-1"),
         "leaseDurationSeconds": 30,
         "lostGraceSeconds": 60,

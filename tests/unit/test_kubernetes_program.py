@@ -128,6 +128,9 @@ def made(rig: Rig) -> Iterator[PoolProvisioner]:
     made.close()
 
 
+NO_KEY = {"reason": "InvalidCredentials", "message": "the Secret mine has no valid key."}
+
+
 def tell(rig: Rig, **status: object) -> None:
     rig.server.do(rig.server.store.set_status, names.PLURAL, NAMESPACE, "warm", status)
 
@@ -149,21 +152,22 @@ def test_it_waits_until_the_operator_has_told_the_public_key(
 
 
 @pytest.mark.parametrize(
-    ("problems", "why"),
+    ("status", "why"),
     [
-        ([], "Check that an operator runs and serves this namespace"),
-        ([{"message": "the Secret mine has no valid key."}], "the Secret mine has no valid key"),
+        ({}, "Check that an operator runs and serves this namespace"),
+        ({"credentialsSecret": "theirs"}, "names the only program that may ever use it"),
+        ({"problems": [NO_KEY]}, "the Secret mine has no valid key"),
     ],
 )
 def test_a_pool_without_a_public_key_is_named_with_the_reason(
     rig: Rig,
     made: PoolProvisioner,
     monkeypatch: pytest.MonkeyPatch,
-    problems: list[dict[str, str]],
+    status: dict[str, Any],
     why: str,
 ) -> None:
     monkeypatch.setattr(provisioner, "OPERATOR_ABSENT", 0.0)
-    tell(rig, problems=problems)
+    tell(rig, **status)
     with pytest.raises(FiberPoolError, match=why) as caught:
         made._seen_by_operator("warm", threading.Event())
-    assert "'warm' in namespace 'lab' has no public key in its status" in str(caught.value)
+    assert "cannot attach to the FiberPool 'warm' in namespace 'lab'" in str(caught.value)

@@ -10,9 +10,12 @@ import pytest
 
 from fakes.kubernetes_api import Fault
 from fiber._backends.kubernetes import fiber_pool
+from fiber._backends.kubernetes.attached_pool import WarmPool
+from fiber._backends.kubernetes.fiber_pool import FiberPoolClient
 from fiber_api import names
-from unit.kubernetes_rig import MASTER, NAMESPACE, OTHER, Body, Rig, Told, pool_body
+from unit.kubernetes_rig import CERTIFICATE, MASTER, NAMESPACE, OTHER, Body, Rig, Told, pool_body
 from unit.kubernetes_rig import rig as make_rig
+from warm_key import WarmKey
 
 AT_ONCE = replace(MASTER, lease_duration=0)
 """A master whose Lease has expired when it is not renewed for the first time."""
@@ -108,6 +111,24 @@ def test_the_next_master_has_a_higher_epoch_and_the_same_lease(rig: Rig, told: T
     taken = rig.get("leases", names.master_lease_name("warm"))
     assert taken["spec"]["holderIdentity"] == OTHER.identity
     assert taken["spec"]["acquireTime"] == taken["spec"]["renewTime"]
+
+
+def test_a_program_that_the_operator_does_not_sign_for_gets_the_reason(
+    rig: Rig, told: Told, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Sign with another key than that of the status before."""
+    monkeypatch.setattr(fiber_pool, "OPERATOR_SLOW", 0.0)
+    monkeypatch.setattr(fiber_pool, "OPERATOR_ABSENT", 0.5)
+    credentials = WarmKey().unsigned(CERTIFICATE)
+    attachment = WarmPool(rig.api, NAMESPACE, "warm", MASTER, credentials)
+    client = FiberPoolClient(rig.api, rig.loop, attachment, told)
+    client.start()
+    error = told.error()
+    client.close()
+    assert error.reason == "NoOperator"
+    assert "has no valid signature for this program" in str(error)
+    assert not told.statuses
+    assert not credentials.complete
 
 
 def test_a_lease_without_the_label_gets_it(rig: Rig, told: Told) -> None:

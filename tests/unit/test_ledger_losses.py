@@ -164,7 +164,7 @@ def test_a_lost_worker_s_tasks_run_elsewhere() -> None:
 
 def test_only_the_running_task_is_charged() -> None:
     ledger, (worker,) = ledger_with(1)
-    job = job_of(ledger, range(10), pace=known(1e-4), exact=True)
+    job = job_of(ledger, range(10), pace=known(1e-4), eager=True)
     batch, *unread = assign_all(ledger)
     assert len(batch.items) > 4
     ledger.receive(batch.worker, batch.seq, 0, 2, 0.0)
@@ -193,7 +193,7 @@ def test_a_death_is_charged_to_the_whole_stride_of_very_short_tasks() -> None:
 
 def test_results_that_came_clear_of_suspicion() -> None:
     ledger, (worker,) = ledger_with(1)
-    job = job_of(ledger, range(10), pace=known(1e-4), exact=True)
+    job = job_of(ledger, range(10), pace=known(1e-4), eager=True)
     batch = assign_all(ledger)[0]
     ledger.receive(batch.worker, batch.seq, 0, 2, 0.0)
     ledger.lose(worker, (), (batch.seq, 0))

@@ -18,6 +18,7 @@ from fiber._transport.authentication import AgentHello, Identity
 from fiber._transport.credentials import Credentials, make_credentials
 from fiber._transport.link import Keepalive
 from fiber.errors import AuthenticationError, ConfigError, LinkError, VersionMismatch
+from patience import PATIENCE
 from unit.link_site import Site, black_hole, free_port, port_of, say, vanish
 
 
@@ -278,6 +279,20 @@ def test_another_version_is_refused_and_both_sides_get_both_versions(
         assert of_master in text
         assert theirs.replace("\\", "") in text
     assert agent.links == master.links == []
+
+
+def test_a_proof_in_the_form_of_another_version_is_reported_as_that(site: Site) -> None:
+    """Before protocol 3 the proof had no length."""
+    listener, master = site.listener()
+    identity = replace(Identity.of_this_process("agent-1", "uid"), protocol=2, fiber="0.1")
+    hello = AgentHello(identity, "0" * 32, 0, False).encode()
+    raw = socket.create_connection(("127.0.0.1", port_of(listener.address)), PATIENCE)
+    with authentication.agent_context().wrap_socket(raw) as sock:
+        sock.recv(authentication.SECRET_SIZE)
+        sock.sendall(bytes(32) + len(hello).to_bytes(4, "big") + hello + b"\xff" * 32)
+        master.wait(lambda: master.refusals)
+    assert "Fiber protocol version mismatch" in master.refusals[0]
+    assert "2 (fiberpool 0.1)" in master.refusals[0]
 
 
 def test_another_patch_level_of_python_will_do(site: Site) -> None:

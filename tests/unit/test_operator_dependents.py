@@ -17,8 +17,14 @@ from unit.operator_objects import MASTER
 LABELS = {"fiber.dev/pool": "es", "fiber.dev/pool-uid": "1"}
 
 
+def bring(world: World, name: str, **texts: str) -> None:
+    data = {key: base64.b64encode(text.encode()).decode() for key, text in texts.items()}
+    world.store.create("secrets", NAMESPACE, {"metadata": {"name": name}, "data": data})
+
+
 @played
 async def test_a_secret_that_the_pool_names_is_not_made(world: World) -> None:
+    bring(world, "mine", key="ab" * 32)
     world.make_pool(replicas=2, credentialsSecretName="mine")
     await world.ready(2)
     await world.settled(120)
@@ -71,6 +77,7 @@ def shared(world: World, pool: str) -> bool:
 def test_a_secret_that_an_earlier_pool_names_too_is_refused() -> None:
     async def main() -> None:
         async with a_world() as world:
+            bring(world, "mine", key="ab" * 32)
             world.make_pool(replicas=1, credentialsSecretName="mine")
             await world.ready(1)
             await asyncio.sleep(1)  # creationTimestamp is in whole seconds
@@ -89,20 +96,20 @@ def test_a_secret_that_an_earlier_pool_names_too_is_refused() -> None:
     virtual_time.run(main())
 
 
-def bring(world: World, name: str, **texts: str) -> None:
-    data = {key: base64.b64encode(text.encode()).decode() for key, text in texts.items()}
-    world.store.create("secrets", NAMESPACE, {"metadata": {"name": name}, "data": data})
-
-
 @played
 async def test_a_brought_secret_gives_the_public_key_once_it_is_there(world: World) -> None:
-    world.make_pool(replicas=1, credentialsSecretName="mine")
-    await world.ready(1)
+    pool = world.make_pool(replicas=2, credentialsSecretName="mine")
+    await world.until(lambda: "InvalidCredentials" in world.reasons(), 30)
+    message = world.status()["problems"][0]["message"]
+    assert "there is no Secret mine, which spec.credentialsSecretName names" in message
+    assert world.pods() == []
     assert "publicKey" not in world.status()
     bring(world, "mine", key="ab" * 32)
-    world.edit(replicas=2)
     await world.ready(2)
-    assert world.status()["publicKey"] == pool_signer("ab" * 32).public_key.hex()
+    signer = pool_signer("ab" * 32, pool["metadata"]["uid"])
+    assert world.status()["publicKey"] == signer.public_key.hex()
+    world.store.remove("secrets", NAMESPACE, "mine")
+    await world.until(lambda: "publicKey" not in world.status(), 120)
 
 
 @played
@@ -111,6 +118,12 @@ async def test_a_secret_that_names_the_only_master_gives_no_public_key(world: Wo
     world.make_pool(replicas=1, credentialsSecretName="mine")
     await world.ready(1)
     assert "publicKey" not in world.status()
+    world.make_pool("another", replicas=1)
+    await world.ready(1, "another")
+    assert "publicKey" in world.status("another")
+    patch = {"data": {"master": base64.b64encode(b"cd" * 32).decode()}}
+    world.store.merge("secrets", NAMESPACE, "another-fiber-key", patch)
+    await world.until(lambda: "publicKey" not in world.status("another"), 120)
 
 
 @played

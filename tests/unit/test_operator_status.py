@@ -72,7 +72,7 @@ def test_the_highest_epoch_is_remembered_without_a_master() -> None:
 
 CERTIFICATE = "c7" * 32
 SIGNED = {**MASTER, "epoch": 3, "certificate": CERTIFICATE}
-SIGNER = pool_signer("ab" * 32)
+SIGNER = pool_signer("ab" * 32, UID)
 WARM = PoolSecret(signer=SIGNER)
 
 

@@ -36,6 +36,7 @@ def test_the_init_container_makes_a_key_that_the_pool_signs(tmp_path: Path, key:
         names.ENV_NAME: "warm-1",
         names.ENV_UID: "77",
         names.ENV_EPOCH: "3",
+        names.ENV_POOL_UID: "pool",
         names.ENV_CREDENTIALS: str(tmp_path / "agent.json"),
     }
     assert credentials_file.write(environment) == 0
@@ -71,12 +72,18 @@ def test_what_a_master_knows_makes_no_agent(key: WarmKey) -> None:
 def test_a_signature_serves_one_epoch_and_one_certificate(key: WarmKey) -> None:
     agent, master = key.agent("warm-1", "77"), key.master(3)
     shown, proof = master.certificate.hash, master.prove("warm-1", "77", SAID)
-    assert agent.epoch_of_master(SAID, shown, proof) == 3
-    assert agent.epoch_of_master(SAID, key.master(3).certificate.hash, proof) is None
+    assert agent.check_master(SAID, shown, proof) == (3, shown.hex())
+    assert agent.check_master(SAID, key.master(3).certificate.hash, proof) is None
     later = (4).to_bytes(8, "big") + proof[8:]
-    assert agent.epoch_of_master(SAID, shown, later) is None
-    for cut in (b"", proof[:8], proof[:-1]):
-        assert agent.epoch_of_master(SAID, shown, cut) is None
+    for forged in (later, b"", proof[:8], proof[:-1]):
+        assert agent.check_master(SAID, shown, forged) is None
+
+
+def test_the_next_pool_with_the_same_secret_has_another_key_pair() -> None:
+    first, second = WarmKey(POOL_KEY, "uid-1"), WarmKey(POOL_KEY, "uid-2")
+    master = first.master(50)
+    proof = master.prove("warm-1", "77", SAID)
+    assert second.agent("warm-1", "77").check_master(SAID, master.certificate.hash, proof) is None
 
 
 @pytest.mark.parametrize("signature", [b"", bytes(64)])
@@ -100,7 +107,7 @@ def test_agents_wait_until_the_operator_has_signed(site: Site, key: WarmKey) -> 
 
 
 def test_a_master_that_ends_unsigned_lets_its_agents_dial_on(site: Site, key: WarmKey) -> None:
-    """Nothing that it could answer would be believed."""
+    """Give no answer, since the agent would not believe it."""
     acceptor, certificate = site.acceptor(), site.credentials.certificate
     listener, _ = site.listener(acceptor, credentials=key.unsigned(certificate))
     site.close(listener, linger=0.1)
@@ -113,7 +120,26 @@ def test_a_master_of_an_earlier_epoch_is_refused(site: Site, key: WarmKey) -> No
     listener, _ = site.listener(credentials=key.master(3))
     agent = dial(site, listener.address, key.agent("warm-1", "77", epoch=4))
     agent.wait(lambda: agent.errors)
-    assert "has epoch 3, and this agent belongs to a later one, of epoch 4" in str(agent.errors[0])
+    assert "has epoch 3, and this agent belongs to one of epoch 4" in str(agent.errors[0])
+
+
+def test_another_master_of_the_same_epoch_is_refused(site: Site, key: WarmKey) -> None:
+    """Two programs may get one epoch if the operator signs for the first one late."""
+    listener, _ = site.listener(credentials=key.master(3))
+    met = replace(key.agent("warm-1", "77", epoch=3), met=key.master(3).certificate.hash.hex())
+    agent = dial(site, listener.address, met)
+    agent.wait(lambda: agent.errors)
+    assert "this agent belongs to another one of that epoch" in str(agent.errors[0])
+
+
+def test_a_later_master_that_refuses_an_agent_counts(site: Site, key: WarmKey) -> None:
+    listener, _ = site.listener(credentials=key.master(7))
+    listener._knows = lambda identity: "it is no pod"
+    identity = Identity.of_this_process("warm-1", "77")
+    agent = key.agent("warm-1", "77", epoch=3)
+    dialling, notes = site.dialer(listener.address, credentials=agent, identity=identity)
+    notes.wait(lambda: notes.errors)
+    assert dialling.credentials.epoch == 7
 
 
 def test_an_agent_of_another_pool_is_a_stranger(site: Site, key: WarmKey) -> None:

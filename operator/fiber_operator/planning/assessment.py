@@ -15,7 +15,7 @@ from fiber_api import names
 from fiber_api.names import ConditionType, Reason
 from fiber_api.v1alpha1 import FiberPool, PoolCondition
 from fiber_operator.planning import failures, manifests, plans
-from fiber_operator.planning.documents import items, mapping, past
+from fiber_operator.planning.documents import items, mapping, unless_ahead
 from fiber_operator.planning.plans import Knowledge
 from fiber_operator.planning.pods import PodState, PodView, Trouble
 
@@ -106,14 +106,14 @@ def idleness(pool: FiberPool, master_state: MasterState, now: float) -> Idleness
     if idle is None or master is None or pool.spec.replicas or master_state.alive is False:
         return Idleness()
     same = pool.status.master_epoch == master.epoch
-    since = (past(pool.status.idle_since, now) if same else None) or float(math.floor(now))
+    since = (unless_ahead(pool.status.idle_since, now) if same else None) or float(math.floor(now))
     due = since + idle.timeout_seconds
     return Idleness(since, due if now < due else None)
 
 
 def _lost_since(pool: FiberPool, before: PoolCondition | None, now: float) -> float:
     if before is not None and before.status == "False":
-        known = past(before.last_transition_time, now)
+        known = unless_ahead(before.last_transition_time, now)
         # The pool may be deleted because of this time: it must not be before the pool's creation.
         if known is not None and known >= (pool.metadata.creation_timestamp or 0.0):
             return known

@@ -37,7 +37,7 @@ CLUSTER_SKEW = 60.0
 """Seconds by which the clocks of a cluster may differ."""
 
 
-def past(time: float | None, now: float) -> float | None:
+def unless_ahead(time: float | None, now: float) -> float | None:
     """Return ``time``; None if it is over CLUSTER_SKEW ahead, as the operator did not write it."""
     return None if time is None or time > now + CLUSTER_SKEW else time
 

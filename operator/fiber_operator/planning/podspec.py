@@ -361,6 +361,7 @@ def _identity_container(
         {"name": names.ENV_KEY, "value": names.KEY_DIRECTORY},
         {"name": names.ENV_CREDENTIALS, "value": _CREDENTIALS},
         {"name": names.ENV_EPOCH, "value": str(_highest_epoch(pool))},
+        {"name": names.ENV_POOL_UID, "value": pool.metadata.uid},
         _of_the_pod(names.ENV_NAME, "metadata.name"),
         _of_the_pod(names.ENV_UID, "metadata.uid"),
     ]

@@ -16,7 +16,7 @@ from fiber_api.times import format_time
 from fiber_api.v1alpha1 import FiberPool, Problem
 from fiber_operator.planning import messages
 from fiber_operator.planning.assessment import MasterState, find_cut_off
-from fiber_operator.planning.documents import past
+from fiber_operator.planning.documents import unless_ahead
 from fiber_operator.planning.failures import Account, given_up, in_itself
 from fiber_operator.planning.plans import Knowledge
 from fiber_operator.planning.pods import PodState, PodView, Trouble
@@ -51,7 +51,7 @@ class Situation:
     def previous(self, reason: str) -> Problem | None:
         """Return the problem with that reason from the status."""
         found = next((p for p in self.pool.status.problems if p.reason == reason), None)
-        if found is None or past(found.since, self.now) is not None:
+        if found is None or unless_ahead(found.since, self.now) is not None:
             return found
         return found.model_copy(update={"since": float(math.floor(self.now))})
 

@@ -338,10 +338,10 @@ class _Planner:
     def _hold_back(self) -> int:
         """Return how many failed workers are still wanted and not to be replaced yet."""
         missing = max(0, self._facts.desired - len(self._remaining))
-        found = self._account.failures
-        if found.waiting > missing:
-            found = found.model_copy(update={"waiting": missing})
-            self._account = replace(self._account, failures=found)
+        counted = self._account.failures
+        if counted.waiting > missing:
+            counted = counted.model_copy(update={"waiting": missing})
+            self._account = replace(self._account, failures=counted)
         return min(self._account.held_back, missing)
 
     def _creations(self, held_back: int) -> tuple[int, float | None]:
@@ -389,7 +389,7 @@ class _Planner:
             facts.master_state,
             judged=judged,
             create=create,
-            delete=len(facts.live) - len(self._remaining),
+            delete_live=len(facts.live) - len(self._remaining),
             waits_until=failures.held_back_until(self._account.failures, facts.now),
             draining=0 if facts.ends else max(0, len(self._remaining) - facts.desired),
             replacing=self._to_be_replaced(),

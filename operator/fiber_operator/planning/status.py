@@ -19,7 +19,7 @@ from fiber_api.times import format_time
 from fiber_api.v1alpha1 import FiberPool, FiberPoolStatus, PoolCondition, Problem
 from fiber_operator.planning import manifests, messages
 from fiber_operator.planning.assessment import Assessment, MasterState
-from fiber_operator.planning.documents import mapping, past, whole
+from fiber_operator.planning.documents import mapping, unless_ahead, whole
 from fiber_operator.planning.failures import Account
 from fiber_operator.planning.plans import Deletion, Obstacle, PoolEvent
 from fiber_operator.planning.pods import PodState, PodView
@@ -69,7 +69,7 @@ class Outlook:
     judged: bool = True
     """False while a dry run of the template is needed."""
     create: int = 0
-    delete: int = 0
+    delete_live: int = 0
     """Live pods that are deleted now."""
     waits_until: float | None = None
     """Time before which failed workers are not replaced."""
@@ -118,7 +118,7 @@ def dated(
     same = before is not None and before.status == finding.status
     since = finding.since
     if since is None and before is not None and same:
-        since = past(before.last_transition_time, now)
+        since = unless_ahead(before.last_transition_time, now)
     return PoolCondition(
         type=finding.type,
         status=finding.status,
@@ -223,7 +223,7 @@ def _progressing(pool: FiberPool, outlook: Outlook) -> Finding:
     if counts.joining:
         message = f"workers without an answer from a master yet: {counts.joining}"
         return Finding(kind, "True", Reason.STARTING, message)
-    if ending := counts.terminating + outlook.delete:
+    if ending := counts.terminating + outlook.delete_live:
         return Finding(kind, "True", Reason.DELETING, f"workers ending: {ending}")
     if missing and (worst := outlook.worst):
         return Finding(kind, "False", worst.reason, lack)
@@ -325,7 +325,7 @@ def describe(facts: Assessment, outlook: Outlook, account: Account) -> FiberPool
 
 def _public_key(facts: Assessment) -> str | None:
     if (secret := facts.knowledge.secret) is None:
-        return facts.pool.status.public_key
+        return None if facts.knowledge.credentials is False else facts.pool.status.public_key
     return secret.signer.public_key.hex() if secret.signer else None
 
 
@@ -333,6 +333,8 @@ def _master_signature(facts: Assessment) -> str | None:
     """Return the signature for the master that the EndpointSlice leads to, if it asks for one."""
     master, secret, before = facts.pool.spec.master, facts.knowledge.secret, facts.pool.status
     if master is None or master.certificate is None:
+        return None
+    if facts.knowledge.credentials is False:
         return None
     if secret is None or not facts.knowledge.led:
         return before.master_signature if before.master_epoch == master.epoch else None
@@ -384,7 +386,7 @@ def describe_unreadable(
         reason=Reason.INVALID_SPEC,
         severity="Error",
         terminal=True,
-        since=(past(known.since, now) if known else None) or float(math.floor(now)),
+        since=(unless_ahead(known.since, now) if known else None) or float(math.floor(now)),
         message=message,
     )
     after = before.model_copy(
@@ -437,7 +439,7 @@ def describe_blind(
 
 def _lasting(obstacle: Obstacle, before: FiberPoolStatus, now: float) -> Problem:
     known = next((p for p in before.problems if p.reason == obstacle.reason), None)
-    since = (past(known.since, now) if known else None) or float(math.floor(now))
+    since = (unless_ahead(known.since, now) if known else None) or float(math.floor(now))
     was_error = known is not None and known.severity == "Error"
     lasts = was_error or now - since >= SECOND_LOOK or obstacle.reason != Reason.API_UNAVAILABLE
     return Problem(

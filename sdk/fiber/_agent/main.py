@@ -16,7 +16,6 @@ import socket
 import sys
 import sysconfig
 import time
-from dataclasses import replace
 from multiprocessing import current_process
 from typing import NoReturn
 
@@ -162,7 +161,7 @@ class Main:
         return None if end_descendants(_LEFT) else _LEFT_BEHIND
 
     def _hand_on_credentials(self) -> None:
-        descriptor = replace(self._credentials, epoch=self._dialer.epoch).to_descriptor()
+        descriptor = self._dialer.credentials.to_descriptor()
         os.set_inheritable(descriptor, True)
         self._environment[_CREDENTIALS] = f"{_DESCRIPTOR}{descriptor}"
 
@@ -212,8 +211,8 @@ class Main:
         elif self._waits_until is None or self._timeout():
             # The master answered and refused: it is ending, or took the name for another agent's.
             if isinstance(error, EarlierMaster) and self._waits_until is None:
-                # A past master may have claimed an epoch above that of all later ones.  The next
-                # pod gets its epoch from the operator.
+                # No later master may come: the epochs begin anew if the pool's status is lost.  The
+                # next pod gets its epoch from the operator.
                 self._environment[_WAITS_UNTIL] = str(time.monotonic() + self._lost_grace)
             self._again = True
             self._loop.call_later(_REFUSED_PAUSE, self._loop.stop)

@@ -82,16 +82,16 @@ class Ledger:
         limits: Limits = Limits(),  # noqa: B008 - immutable
         unit: int = 1,
         alone: bool = False,
-        exact: bool = False,
+        eager: bool = False,
     ) -> Job:
         """Open a new job; ``limits`` says how often a task of it runs again.
 
         ``unit``: smallest chunk of contiguous tasks in a batch.  ``alone``: each task travels
         alone, to an idle worker, with no batch queued behind it.  A job without retries does so
-        too, since after a crash it must be known which task had run.  ``exact``: results are wanted
+        too, since after a crash it must be known which task had run.  ``eager``: results are wanted
         one by one, and the worker notes each task that it begins.
         """
-        job = Job(owner, pace or TaskPace(), limits, unit, alone, exact)
+        job = Job(owner, pace or TaskPace(), limits, unit, alone, eager)
         self.jobs.add(job)
         return job
 

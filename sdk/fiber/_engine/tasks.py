@@ -204,7 +204,7 @@ class Job:
         "charges",
         "closed",
         "done",
-        "exact",
+        "eager",
         "fed",
         "listed",
         "owner",
@@ -217,12 +217,12 @@ class Job:
     )
 
     def __init__(
-        self, owner: Any, pace: TaskPace, limits: Limits, unit: int, alone: bool, exact: bool
+        self, owner: Any, pace: TaskPace, limits: Limits, unit: int, alone: bool, eager: bool
     ) -> None:
         self.owner = owner
         self.pace = pace
         self.unit = unit
-        self.exact = exact
+        self.eager = eager
         self.alone = alone or limits.retries == 0
         self.waiting = WaitingTasks()
         self.batches: dict[Batch, None] = {}  # batches of it that workers have
@@ -238,7 +238,7 @@ class Job:
     @property
     def target(self) -> float:
         """Seconds of work that one of the job's messages should carry."""
-        return PROMPT if self.exact else TARGET
+        return PROMPT if self.eager else TARGET
 
     @property
     def has_next(self) -> bool:
@@ -319,7 +319,7 @@ class Batch:
         self.items = span.items
         self.alone = span.alone
         self.pin = span.pin
-        self.stride = 1 if job is None or job.exact else job.pace.stride()
+        self.stride = 1 if job is None or job.eager else job.pace.stride()
         self.unit = 1 if job is None else job.unit
         self.received = 0
         self._received_from = 0

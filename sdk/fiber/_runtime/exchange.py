@@ -309,7 +309,7 @@ def _pack(item: WorkItem, batch: Batch, encoded: Encoded, sent: dict[int, None])
     carry = function.id not in sent
     head = work.Head(
         item.kind,
-        0 if item.exact else batch.stride,
+        0 if item.eager else batch.stride,
         item.unit,
         function.id,
         (len(function.data) or work.BESIDE) if carry else 0,

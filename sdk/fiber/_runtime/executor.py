@@ -452,7 +452,7 @@ class PoolExecutor:
     def _adopt(self, leased: LeasedWorker, call: Call) -> None:
         """Take over a call that its caller sent to a worker: its answer comes through the loop."""
         handle = leased.handle
-        item = WorkItem(work.CALLS, exact=True)
+        item = WorkItem(work.CALLS, eager=True)
         job = self._jobs.open(item)
         assert handle.worker is not None
         self._scheduler.return_busy(handle.worker, leased.seq, job, call, self._loop.now())

@@ -50,7 +50,7 @@ class Jobs:
             limits=item.limits or self._limits,
             unit=item.unit,
             alone=item.timeout is not None,
-            exact=item.exact,
+            eager=item.eager,
         )
         return job
 
@@ -247,7 +247,7 @@ class CallQueue:
         cancellable: bool = False,
     ) -> None:
         self.item = WorkItem(
-            work.CALLS, exact=True, timeout=timeout, limits=limits, cancellable=cancellable
+            work.CALLS, eager=True, timeout=timeout, limits=limits, cancellable=cancellable
         )
         self.called: deque[Call] = deque()
         """Calls that the loop has not taken.  Any thread appends."""

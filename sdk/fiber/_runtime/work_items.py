@@ -298,7 +298,7 @@ class WorkItem:
 
     __slots__ = (
         "cancellable",
-        "exact",
+        "eager",
         "function",
         "future",
         "grants",
@@ -317,7 +317,7 @@ class WorkItem:
         function: Function | None = None,
         future: TaskFuture | None = None,
         unit: int = 1,
-        exact: bool = False,
+        eager: bool = False,
         timeout: float | None = None,
         limits: Limits | None = None,
         cancellable: bool = False,
@@ -326,7 +326,7 @@ class WorkItem:
         self.function = function
         self.future = future
         self.unit = unit
-        self.exact = exact
+        self.eager = eager
         """True if results are wanted one by one, as with ``chunksize=1``."""
         self.timeout = timeout
         self.limits = limits

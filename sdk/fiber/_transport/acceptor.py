@@ -54,6 +54,9 @@ _TURN = 16
 _PAUSE = 0.2
 """Seconds without accepting after the process ran out of descriptors."""
 
+_PAST = 16
+"""Ended pools whose agents are told why they are refused."""
+
 _LAST_WORD = 1.0
 """Seconds for the peer to read the reason for a refusal.  Closing at once could destroy it."""
 
@@ -93,7 +96,7 @@ class Acceptor:
         self._lock = threading.Lock()
         self._pools: tuple[ServedPool, ...] = ()
         self._past: tuple[ServedPool, ...] = ()
-        """Pools that were removed.  Their agents get that as the reason, and are no strangers."""
+        """The last pools that were removed.  Their agents get that as the reason."""
         self._refusals = Refusals()
         descriptors = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
         most = min(_MOST, max(descriptors // 4, 2))
@@ -122,7 +125,7 @@ class Acceptor:
         with self._lock:
             if pool in self._pools:
                 self._pools = tuple(other for other in self._pools if other is not pool)
-                self._past += (past,)
+                self._past = (*self._past, past)[-_PAST:]
 
     def take(self, sock: socket.socket, origin: str) -> None:
         """Treat a connection from elsewhere, for example from a relay, as if it were accepted."""
@@ -372,7 +375,7 @@ class PendingConnection:
 
     def _too_late(self) -> None:
         if self._awaited:  # a proven agent: no number of strangers suppresses this report
-            self.report_proven(f"{self._awaited}, and there was none within {_DEADLINE:g} s")
+            self.report_proven(f"{self._awaited} did not appear within {_DEADLINE:g} s")
             self.close()
         else:
             self.refuse(f"it did not prove itself within {_DEADLINE:g} s")

@@ -23,8 +23,8 @@ understand each other can still say why.
 The agent's proof covers the random bytes of both sides, the certificate that TLS has shown, and the
 greeting beside it.  So it is valid for one connection with one master.  A peer in the middle, which
 shows another certificate, cannot pass it on.  The master's proof covers the same, or, in a warm
-pool, the certificate alone: TLS proves the rest.  ``fiber._transport.credentials`` makes and checks
-the proofs.
+pool, its certificate and epoch alone: TLS proves the rest.  ``fiber._transport.credentials`` makes
+and checks the proofs.
 
 Each side of the handshake is a generator: it yields the event (``select.POLLIN`` or ``POLLOUT``)
 for which it has to wait, and never blocks.  TLS works on the socket itself and not on buffers in
@@ -47,7 +47,12 @@ from collections.abc import Callable, Generator, Mapping
 from importlib import metadata
 from typing import Any, NamedTuple, TypeAlias, TypeVar
 
-from fiber._transport.credentials import Certificate, Credentials, MasterCredentials
+from fiber._transport.credentials import (
+    Certificate,
+    Credentials,
+    MasterCredentials,
+    ProvenMaster,
+)
 from fiber._wire.messages import PROTOCOL, ProtocolError
 from fiber.errors import AuthenticationError, ConfigError, VersionMismatch
 
@@ -164,6 +169,14 @@ def version_mismatch(ours: Identity, theirs: Identity) -> VersionMismatch | None
     if _minor(ours.python) != _minor(theirs.python):
         return VersionMismatch("Python", ours=ours.python, theirs=theirs.python, peer=theirs.name)
     return None
+
+
+def _mismatch_in(greeting: bytes) -> VersionMismatch | None:
+    try:
+        theirs = decode_greeting(greeting).identity
+    except ProtocolError:
+        return None
+    return version_mismatch(Identity.of_this_process(""), theirs)
 
 
 def _minor(version: str) -> list[str]:
@@ -401,13 +414,19 @@ class _Handshake:
         """Read a greeting or a proof."""
         (size,) = _LENGTH.unpack((yield from self._read_exactly(_LENGTH.size)))
         if size > limit:
-            raise ProtocolError(f"its {what} of {size} bytes is too long")
+            raise ProtocolError(f"its {what} is longer than {limit} bytes")
         return (yield from self._read_exactly(size))
 
     def _read_proven(self) -> Steps[tuple[bytes, bytes]]:
         """Read a greeting and its proof."""
         greeting = yield from self._read("greeting", LARGEST_GREETING)
-        return greeting, (yield from self._read("proof", _LONGEST_PROOF))
+        try:
+            return greeting, (yield from self._read("proof", _LONGEST_PROOF))
+        except ProtocolError:
+            # Another version of Fiber may write proofs in another way.
+            if mismatch := _mismatch_in(greeting):
+                raise ProtocolError(str(mismatch)) from mismatch
+            raise
 
     def _read_exactly(self, size: int) -> Steps[bytes]:
         data = b""
@@ -440,11 +459,8 @@ class AgentHandshake(_Handshake):
 
     _for_master = False
 
-    def ask(self, credentials: Credentials, hello: bytes) -> Steps[tuple[bytes, int]]:
-        """Send ``hello`` with a proof.
-
-        Check the master's proof, and return the master's answer and its epoch.
-        """
+    def ask(self, credentials: Credentials, hello: bytes) -> Steps[tuple[bytes, ProvenMaster]]:
+        """Send ``hello`` with a proof; return the answer, and the master that has proved itself."""
         yield from self._when_ready(self.sock.do_handshake)
         seen = hashlib.sha256(self.sock.getpeercert(binary_form=True) or b"").digest()
         if credentials.master and seen.hex() != credentials.master:
@@ -458,10 +474,10 @@ class AgentHandshake(_Handshake):
                 "the master does not believe that this agent is the pod it claims to be"
             )
         said = self._said(b"master", seen, answer)
-        epoch = credentials.epoch_of_master(said, seen, proof)
-        if epoch is None:
+        master = credentials.check_master(said, seen, proof)
+        if master is None:
             raise Untrusted("it cannot prove that it is this pool's master")
-        return answer, epoch
+        return answer, master
 
 
 class MasterHandshake(_Handshake):

@@ -20,7 +20,7 @@ import json
 import os
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from fiber._transport import credentials_file
 from fiber.errors import ConfigError
@@ -28,6 +28,14 @@ from fiber_api import identity, signatures
 
 _VALIDITY = datetime.timedelta(days=3650)
 """Validity of a certificate.  No side reads it: agents compare the certificate's fingerprint."""
+
+
+class ProvenMaster(NamedTuple):
+    """Master that has proved itself to an agent."""
+
+    epoch: int
+    certificate: str
+    """Fingerprint of its certificate."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +54,9 @@ class Credentials:
     """Signature of the warm pool for the name, the uid and the public key of this agent."""
     epoch: int = 0
     """Lowest epoch of a master that this agent serves: that of the latest one when its pod was
-    made, or of the latest one that it has served."""
+    made, or of the latest one that has proved itself."""
+    met: str = ""
+    """Fingerprint of the master of that epoch, if it has proved itself to this agent."""
 
     @classmethod
     def from_file(cls, path: str | os.PathLike[str]) -> Credentials:
@@ -97,7 +107,7 @@ class Credentials:
     @classmethod
     def _read(cls, data: bytes) -> Credentials:
         values = json.loads(data)
-        return cls(
+        made = cls(
             str(values["name"]),
             str(values["uid"]),
             identity.check_key(values["key"]),
@@ -105,7 +115,13 @@ class Credentials:
             str(values.get("pool", "")),
             str(values.get("signature", "")),
             int(values.get("epoch", 0)),
+            str(values.get("met", "")),
         )
+        sizes = (len(bytes.fromhex(made.pool)), len(bytes.fromhex(made.signature)))
+        signed = (signatures.PUBLIC_KEY_SIZE, signatures.SIGNATURE_SIZE)
+        if sizes != ((0, 0) if made.master else signed):
+            raise ValueError("neither the only master nor a signature of the pool")
+        return made
 
     def prove(self, said: bytes) -> bytes:
         """Return the proof that this agent has said ``said``."""
@@ -114,18 +130,19 @@ class Credentials:
         signer = signatures.Signer(self.key)
         return signer.public_key + bytes.fromhex(self.signature) + signer.sign(said)
 
-    def epoch_of_master(self, said: bytes, certificate: bytes, proof: bytes) -> int | None:
-        """Return the epoch of the master that has said ``said``; None if its proof is not valid.
+    def check_master(self, said: bytes, certificate: bytes, proof: bytes) -> ProvenMaster | None:
+        """Return the master that has said ``said``; None if its proof is not valid.
 
         ``certificate`` is the SHA-256 of the one that the master has shown.  TLS proves that the
         master is its owner.
         """
-        if not self.pool:
-            return self.epoch if hmac.compare_digest(proof, _hmac(self.key, said)) else None
-        epoch, signature = int.from_bytes(proof[:_EPOCH_SIZE], "big"), proof[_EPOCH_SIZE:]
-        statement = signatures.master_statement(epoch, certificate)
-        is_valid = signatures.is_signed(bytes.fromhex(self.pool), statement, signature)
-        return epoch if is_valid else None
+        if self.pool:
+            epoch, signature = int.from_bytes(proof[:_EPOCH_SIZE], "big"), proof[_EPOCH_SIZE:]
+            statement = signatures.master_statement(epoch, certificate)
+            is_valid = signatures.is_signed(bytes.fromhex(self.pool), statement, signature)
+        else:
+            epoch, is_valid = self.epoch, hmac.compare_digest(proof, _hmac(self.key, said))
+        return ProvenMaster(epoch, certificate.hex()) if is_valid else None
 
 
 _EPOCH_SIZE = 8

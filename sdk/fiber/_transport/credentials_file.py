@@ -26,7 +26,7 @@ def write(environment: Mapping[str, str]) -> int:
         if pin.exists():
             values |= {"key": identity.agent_key(key, name, uid), "master": pin.read_text().strip()}
         else:
-            values |= _signed(key, name, uid)
+            values |= _signed(key, environment[names.ENV_POOL_UID], name, uid)
         _write(environment[names.ENV_CREDENTIALS], json.dumps(values).encode())
         _link_interpreter(Path(environment[names.ENV_CREDENTIALS]).parent)
     except KeyError as error:
@@ -36,9 +36,9 @@ def write(environment: Mapping[str, str]) -> int:
     return 0
 
 
-def _signed(pool_key: str, name: str, uid: str) -> dict[str, str]:
+def _signed(pool_key: str, pool_uid: str, name: str, uid: str) -> dict[str, str]:
     """Return a new secret for the agent, and the pool's signature for its public key."""
-    pool, secret = signatures.pool_signer(pool_key), identity.new_key()
+    pool, secret = signatures.pool_signer(pool_key, pool_uid), identity.new_key()
     statement = signatures.agent_statement(name, uid, signatures.Signer(secret).public_key)
     signature = pool.sign(statement).hex()
     return {"key": secret, "pool": pool.public_key.hex(), "signature": signature}

@@ -17,6 +17,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import chain, zip_longest
 from typing import NamedTuple
 
@@ -30,7 +31,7 @@ from fiber._transport.authentication import (
     Secrets,
     parse_addresses,
 )
-from fiber._transport.credentials import Credentials
+from fiber._transport.credentials import Credentials, ProvenMaster
 from fiber._transport.link import Keepalive, Link, LinkConnection
 from fiber._transport.loop import Loop
 from fiber._transport.nng import SealedConnection
@@ -87,7 +88,8 @@ class AgentDialer:
         parse_addresses(address)
         self._loop = loop
         self._address = address
-        self._credentials = credentials
+        self.credentials = credentials
+        """Credentials of the agent, with the epoch of the last master that has proved itself."""
         self._context = authentication.agent_context()
         self._identity = identity
         self._on_link = on_link
@@ -97,8 +99,6 @@ class AgentDialer:
         self._name = secrets.token_hex(16)
         self._link: Link | None = None
         self._obstacle = "no attempt was made"
-        self.epoch = credentials.epoch
-        """Epoch of the master, once there is a link."""
         self.lost_grace: float | None = None
         """Seconds to wait for another master if this one is lost, once there is a link."""
         self._over = threading.Event()
@@ -157,10 +157,10 @@ class AgentDialer:
         until = since + seconds * random.uniform(0.5, 1.0)
         return self._over.wait(max(until - time.monotonic(), 0.0))
 
-    def _exchange_greetings(self, hello: bytes) -> tuple[bytes, int, int, Secrets]:
+    def _exchange_greetings(self, hello: bytes) -> tuple[bytes, ProvenMaster, int, Secrets]:
         """Connect and exchange greetings.
 
-        Return the master's answer and epoch, and the connection without TLS.
+        Return the answer, the master, and the connection without TLS.
         """
         sock = self._connect(self._address)
         tls_handshake = authentication.AgentHandshake(sock, self._context)
@@ -168,10 +168,10 @@ class AgentDialer:
             with self._lock:
                 self._sock = tls_handshake.sock
             deadline = time.monotonic() + _GREET
-            answer, epoch = self._finish(
-                tls_handshake, tls_handshake.ask(self._credentials, hello), deadline
+            answer, master = self._finish(
+                tls_handshake, tls_handshake.ask(self.credentials, hello), deadline
             )
-            return answer, epoch, *self._finish(tls_handshake, tls_handshake.end(), deadline)
+            return answer, master, *self._finish(tls_handshake, tls_handshake.end(), deadline)
         finally:
             with self._lock:
                 self._sock = None
@@ -196,27 +196,35 @@ class AgentDialer:
 
     # On the loop thread
 
-    def _answered(self, answer: bytes, epoch: int, descriptor: int, secrets: Secrets) -> None:
+    def _answered(
+        self, answer: bytes, master: ProvenMaster, descriptor: int, secrets: Secrets
+    ) -> None:
         if self._over.is_set():
             os.close(descriptor)
             return
         try:
-            welcome = self._check_answer(answer, epoch)
+            self._check_epoch(master)
+            welcome = self._check_answer(answer)
         except (FiberError, AuthenticationError) as error:
             os.close(descriptor)
             self._fail(error)
         else:
-            self.epoch = epoch
             self._welcomed(welcome, descriptor, secrets)
 
-    def _check_answer(self, answer: bytes, epoch: int) -> MasterWelcome:
-        """Return the welcome in the answer of the master; raise an error if it is a refusal."""
-        if epoch < self.epoch:
+    def _check_epoch(self, master: ProvenMaster) -> None:
+        """Note the master's epoch; EarlierMaster if the agent has met a later or an equal one."""
+        met = self.credentials
+        is_equal = master.epoch == met.epoch
+        if master.epoch < met.epoch or (is_equal and met.met not in ("", master.certificate)):
+            later = "another one of that epoch" if is_equal else f"one of epoch {met.epoch}"
             raise EarlierMaster(
-                f"the master at {self._address} has epoch {epoch}, and this agent belongs to a "
-                f"later one, of epoch {self.epoch}: another program has taken the pool. End the "
-                "earlier program"
+                f"the master at {self._address} has epoch {master.epoch}, and this agent belongs "
+                f"to {later}: another program has taken the pool. End the earlier program"
             )
+        self.credentials = replace(met, epoch=master.epoch, met=master.certificate)
+
+    def _check_answer(self, answer: bytes) -> MasterWelcome:
+        """Return the welcome in the answer of the master; raise an error if it is a refusal."""
         try:
             greeting = authentication.decode_greeting(answer)
         except ProtocolError as error:

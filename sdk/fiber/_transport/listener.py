@@ -140,12 +140,12 @@ class MasterListener:
     def _greet(self, pending: PendingConnection, hello: AgentHello) -> None:
         """Answer an agent that has proved its name and uid."""
         if not self._credentials.complete:
-            what = "the operator has not signed this program's certificate yet"
+            what = "the operator's signature for this program"
             self._let_wait(pending, hello, what)
             return
         reason = self._objection(hello)
         if reason is None:
-            self._let_wait(pending, hello, f"there is no pod {hello.identity.name!r} yet")
+            self._let_wait(pending, hello, f"the pod {hello.identity.name!r}")
         elif reason:
             self._refuse(pending, reason)
         else:

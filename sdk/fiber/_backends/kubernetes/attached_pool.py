@@ -19,7 +19,7 @@ from typing import Any
 from fiber import _logs
 from fiber._backends.kubernetes.api import TIMEOUT, Api
 from fiber._exceptions import fresh
-from fiber._transport.credentials import OwnCredentials
+from fiber._transport.credentials import OwnCredentials, WarmCredentials
 from fiber.errors import FiberPoolError
 from fiber_api import names
 from fiber_api.names import ConditionType
@@ -49,7 +49,7 @@ class PoolMaster:
     port: int
     identity: str
     """Unique name of the program, also shown to users."""
-    certificate: str = ""
+    certificate: str
     """SHA-256 of the certificate that the program shows the agents, in hexadecimal digits."""
     lease_duration: int = 30
     lost_grace: int = 60
@@ -66,7 +66,7 @@ class PoolMaster:
             "port": self.port,
             "epoch": epoch,
             "identity": self.identity,
-            **({"certificate": self.certificate} if self.certificate else {}),
+            "certificate": self.certificate,
             "leaseName": names.master_lease_name(pool),
             "leaseDurationSeconds": self.lease_duration,
             "lostGraceSeconds": self.lost_grace,
@@ -77,10 +77,17 @@ class AttachedPool:
     """FiberPool whose master this program is.  Calls block and raise ``ApiError``."""
 
     def __init__(
-        self, api: Api, found: Body, master: PoolMaster, epoch: int, *, kept_by_others: bool = False
+        self,
+        api: Api,
+        found: Body,
+        master: PoolMaster,
+        epoch: int,
+        credentials: WarmCredentials | None = None,
     ) -> None:
+        """``credentials``: those for a pool of another owner, which the operator has to sign."""
         self._api = api
-        self.kept_by_others = kept_by_others
+        self._credentials = credentials
+        self.kept_by_others = credentials is not None
         """True if other programs may be its master before and after this one."""
         self.master = master
         self.epoch = epoch
@@ -136,6 +143,16 @@ class AttachedPool:
             "spec": spec,
         }
         self.generation = int(self._api.apply(self.path, body, **how)["metadata"]["generation"])
+
+    def take_signature(self, status: Body) -> bool:
+        """Take the operator's signature in the pool's status; return False if one is missing."""
+        if self._credentials is None or self._credentials.complete:
+            return True
+        try:
+            signature = bytes.fromhex(status.get("masterSignature") or "")
+        except ValueError:
+            return False
+        return self._credentials.take_signature(self.epoch, signature)
 
     def loss(self, found: Body | None) -> FiberPoolError | None:
         """Return the error if this program lost the pool, whose document is ``found`` now."""
@@ -420,9 +437,11 @@ class WarmPool:
         namespace: str,
         name: str,
         master: PoolMaster,
+        credentials: WarmCredentials,
     ) -> None:
         self._api = api
         self._master = master
+        self._credentials = credentials
         self._attached: AttachedPool | None = None
         self._replicas = 0
         """Replicas of the pool before, which ``detach`` restores."""
@@ -502,7 +521,7 @@ class WarmPool:
         return True
 
     def _as_master(self, found: Body, epoch: int) -> AttachedPool:
-        return AttachedPool(self._api, found, self._master, epoch, kept_by_others=True)
+        return AttachedPool(self._api, found, self._master, epoch, self._credentials)
 
     def _check_lost(self, found: Body, there: Body) -> None:
         """Raise FiberPoolError unless the operator says that the present master is lost."""

@@ -347,25 +347,15 @@ class Pods:
         """Take the pool's present status."""
         before = self._waiting.status
         self._waiting.on_status(status)
-        self._take_signature(status)
         if self._prepared is not None:
+            if not before:  # agents may wait until the operator has signed for this program
+                self._prepared.listener.look_again()
             # A warm pool keeps ``min_pods``, unless the operator has detached this program.
             self._demand.floor = min(self._prepared.min_pods, status.get("desiredReplicas") or 0)
         if before.get("templateHash") != status.get("templateHash"):
             for agent in self.agents.agents.values():
                 self._describe(agent)
         self._changed()
-
-    def _take_signature(self, status: Document) -> None:
-        """Take the operator's signature for this program; agents may wait for it."""
-        prepared, signature = self._prepared, status.get("masterSignature")
-        if prepared is None or prepared.unsigned is None or not signature:
-            return
-        credentials = prepared.unsigned
-        if not credentials.complete and credentials.take_signature(
-            status.get("masterEpoch") or 0, bytes.fromhex(signature)
-        ):
-            prepared.listener.look_again()
 
     def connected(self) -> int:
         """Return how many agents are linked; any thread may ask."""

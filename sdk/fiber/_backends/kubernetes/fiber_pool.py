@@ -41,6 +41,17 @@ OPERATOR_SLOW, OPERATOR_ABSENT = 5.0, 30.0
 CLOSE_TIMEOUT = 10.0
 """Seconds that the API server may take to delete a pool, or to detach from it."""
 
+_NO_STATUS = (
+    "was not reconciled by an operator for {seconds:.0f} s. Check that one runs and serves this "
+    "namespace (`kubectl get deployments -A -l app.kubernetes.io/name=fiber-operator`), or install "
+    "it: `helm install fiber-operator charts/fiber-operator -n fiber-system --create-namespace`"
+)
+_NO_SIGNATURE = (
+    "has no valid signature for this program in its status after {seconds:.0f} s, so no agent "
+    "would serve this program. If the pool's Secret was made anew, start the program again; else "
+    "look at the operator's log"
+)
+
 _RENEW, _WATCH = "renew the Lease of", "watch"
 """Actions that may fail, in words that the name of the pool follows."""
 
@@ -125,7 +136,8 @@ class FiberPoolClient:
         self._generation = 0
         """Generation of the first spec with this program as its master."""
         self._observed = False
-        """True once the operator has seen this program as the pool's master."""
+        """True once the operator serves this program as the pool's master."""
+        self._lacks = _NO_STATUS
         self._began = 0.0
         """Time since which a status of the operator could have arrived."""
         self._followers: list[Informer | LeaseRenewer] = []
@@ -243,13 +255,7 @@ class FiberPoolClient:
         if self._observed:
             return math.inf
         silent = time.monotonic() - self._began
-        error = self._reporter.error(
-            "NoOperator",
-            f"was not reconciled by an operator for {silent:.0f} s. Check that one runs and "
-            "serves this namespace (`kubectl get deployments -A -l "
-            "app.kubernetes.io/name=fiber-operator`), or install it: `helm install fiber-operator "
-            "charts/fiber-operator -n fiber-system --create-namespace`",
-        )
+        error = self._reporter.error("NoOperator", self._lacks.format(seconds=silent))
         if silent >= OPERATOR_ABSENT:
             raise fresh(error)
         if silent < OPERATOR_SLOW:
@@ -274,7 +280,8 @@ class FiberPoolClient:
         assert found is not None
         status = found.get("status") or {}
         if not self._observed and status.get("observedGeneration", 0) >= self._generation:
-            self._observed = True
+            self._lacks = _NO_SIGNATURE
+            self._observed = attached.take_signature(status)
             self._wake.set()
         self._reporter.answered()
         if self._observed:  # else the status may be about the master before

@@ -48,6 +48,7 @@ from fiber._transport.loop import Loop
 from fiber.config import Config
 from fiber.errors import ConfigError, FiberPoolError
 from fiber_api import names
+from fiber_api.names import Reason
 from fiber_api.rest import CLAIMS, NODES, PODS, POOLS, ApiError, Body, Forbidden, NotFound
 
 _SUFFIX_BYTES = 4
@@ -88,8 +89,6 @@ class PreparedPool(NamedTuple):
     """Smallest number of pods."""
     max_pods: int
     """Largest number of pods."""
-    unsigned: WarmCredentials | None = None
-    """Credentials that the operator has to sign; None if the pool is this program's own."""
 
 
 class PoolProvisioner:
@@ -154,7 +153,7 @@ class PoolProvisioner:
         spec, public_key = found["spec"], bytes.fromhex(found["status"]["publicKey"])
         credentials = WarmCredentials(public_key, self._certificate)
         master, listener = self._listen(name, credentials, loop, observer)
-        attachment = WarmPool(self._api, self.namespace, name, master)
+        attachment = WarmPool(self._api, self.namespace, name, master, credentials)
         return PreparedPool(
             listener,
             master.address,
@@ -162,7 +161,6 @@ class PoolProvisioner:
             int(spec.get("processesPerPod", 1)),
             int(spec.get("minReplicas", 0)),
             int(spec.get("maxReplicas", self._config.max_pods)),
-            credentials,
         )
 
     def _seen_by_operator(self, name: str, cancel: threading.Event) -> Body:
@@ -173,25 +171,15 @@ class PoolProvisioner:
             status = found.get("status") or {}
             if status.get("publicKey"):
                 return found
-            if time.monotonic() > deadline or cancel.wait(_LOOK_AGAIN):
-                raise self._without_key(name, status)
-
-    def _without_key(self, name: str, status: Body) -> FiberPoolError:
-        problems = [str(problem.get("message")) for problem in status.get("problems") or ()]
-        why = (
-            f"The pool's status says: {problems[0]}"
-            if problems
-            else "Check that an operator runs and serves this namespace, and that it is not older "
-            "than this program"
-        )
-        return FiberPoolError(
-            f"the FiberPool {name!r} in namespace {self.namespace!r} has no public key in its "
-            f"status, by which this program would know its agents, after {OPERATOR_ABSENT:g} s. "
-            f"{why}",
-            pool=name,
-            namespace=self.namespace,
-            reason="NoOperator",
-        )
+            reason, why = _without_key(status)
+            if reason or time.monotonic() > deadline or cancel.wait(_LOOK_AGAIN):
+                raise FiberPoolError(
+                    f"this program cannot attach to the FiberPool {name!r} in namespace "
+                    f"{self.namespace!r}: {why}",
+                    pool=name,
+                    namespace=self.namespace,
+                    reason=reason or "NoOperator",
+                )
 
     def _listen(
         self, pool: str, credentials: MasterCredentials, loop: Loop, observer: ListenerObserver
@@ -309,6 +297,24 @@ _NODES = 10
 
 _ELSEWHERE = ("192.0.2.1", "2001:db8::1")
 """Unused addresses (RFC 5737, RFC 3849), to which the default route leads."""
+
+
+def _without_key(status: Body) -> tuple[str, str]:
+    """Return why a pool has no public key: a reason in one word, and in words for people.
+
+    The first is empty if waiting may help.
+    """
+    for problem in status.get("problems") or ():
+        if problem.get("reason") == Reason.INVALID_CREDENTIALS:
+            return Reason.INVALID_CREDENTIALS, str(problem.get("message"))
+    why = f"its status has no public key after {OPERATOR_ABSENT:g} s. "
+    if status.get("credentialsSecret"):
+        return "", (
+            f"{why}Its Secret names the only program that may ever use it, or its operator is "
+            "older than this program. Take a pool that no program has made for itself, or install "
+            "the operator anew"
+        )
+    return "", f"{why}Check that an operator runs and serves this namespace"
 
 
 def reachable_address(api: Api, listen_host: str | None, *, pool: str, namespace: str) -> str:
