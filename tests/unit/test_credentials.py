@@ -135,6 +135,13 @@ def test_a_descriptor_brings_them_once(credentials: OwnCredentials) -> None:
         Credentials.from_descriptor(again)
 
 
+def test_credentials_that_do_not_fit_into_a_pipe_are_refused_without_a_leak() -> None:
+    before = os.listdir("/proc/self/fd")
+    with pytest.raises(ConfigError, match="too long for a pipe"):
+        Credentials("a" * (1 << 20), "1", "ab" * 32, "cd" * 32).to_descriptor()
+    assert os.listdir("/proc/self/fd") == before
+
+
 def not_credentials() -> list[bytes]:
     whole = {"name": "a", "uid": "1", "key": "ab" * 32}
     documents = (

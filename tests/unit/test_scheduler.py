@@ -187,6 +187,17 @@ def test_a_pool_whose_tasks_wait_until_results_are_read_shrinks_and_grows_again(
     assert scheduler.decide(12.0).start == 2
 
 
+def test_a_worker_whose_host_ends_is_drained_once_and_replaced_at_once() -> None:
+    scheduler, (member,) = pool(1)
+    assert scheduler.drain(member)
+    assert not scheduler.drain(member), "it leaves already"
+    job_of(scheduler, 1)
+    decisions = scheduler.decide(0.0)
+    assert (decisions.assign, decisions.start) == ([], 1)
+    scheduler.gone(member, 0.0)
+    assert not scheduler.drain(member), "it is gone"
+
+
 def test_without_an_idle_timeout_idle_workers_stay() -> None:
     scheduler, _ = pool(0, 2)
     job_of(scheduler, 2)

@@ -252,6 +252,8 @@ def test_workers_that_die_idle_again_and_again_are_replaced_slowly(workers: Pool
     workers.did_something()
     assert workers.next_try() is None
     assert workers.error is None
+    workers.gone(start(workers, ready=True), 7.0, None)
+    assert workers.next_try() is None, "the count began again with the result"
 
 
 def test_a_worker_that_dies_at_work_is_replaced_at_once(workers: PoolWorkerSet) -> None:
