@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import pickle
@@ -81,6 +82,7 @@ class Pool:
         self.key = WarmKey()
         self._folder = folder
         self._launch = launch
+        self._epochs = itertools.count(1)
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self.address = f"127.0.0.1:{free.getsockname()[1]}"
@@ -104,10 +106,11 @@ class Pool:
         return self.master(credentials=WarmKey().master(1))
 
     def master(
-        self, *grace: str, epoch: int = 1, credentials: WarmCredentials | None = None
+        self, *grace: str, epoch: int | None = None, credentials: WarmCredentials | None = None
     ) -> Program:
-        path = self._folder / f"master-{epoch}"
-        path.write_bytes(pickle.dumps(credentials or self.key.master(epoch)))
+        number = next(self._epochs)
+        path = self._folder / f"master-{number}"
+        path.write_bytes(pickle.dumps(credentials or self.key.master(epoch or number)))
         master = self._launch(MASTER, str(path), self.address, *grace)
         assert master.line() == "listens"
         return master
