@@ -19,7 +19,7 @@ from pathlib import Path
 import pytest
 
 from faults.program import Program, wait_for
-from fiber._transport.credentials import WarmCredentials, make_certificate
+from fiber._transport.credentials import WarmCredentials
 from warm_key import WarmKey
 
 AGENT = """
@@ -173,16 +173,6 @@ def test_an_agent_that_refuses_all_later_masters_ends(pool: Pool) -> None:
     pool.master(epoch=2)
     assert agent.wait() == 0
     assert "this agent belongs to one of epoch 9" in agent.stderr
-
-
-def test_a_master_that_the_operator_has_not_signed_for_gets_no_agent(pool: Pool) -> None:
-    agent = pool.agent(grace=30)
-    certificate = make_certificate()
-    forged = pool.key.unsigned(certificate)
-    forged._proof = (1).to_bytes(8, "big") + bytes(64)
-    pool.master(credentials=forged)
-    assert agent.wait() == 1
-    assert "it cannot prove that it is this pool's master" in agent.stderr
 
 
 PLANTED = """

@@ -148,3 +148,13 @@ def test_an_agent_of_another_pool_is_a_stranger(site: Site, key: WarmKey) -> Non
     agent.wait(lambda: agent.errors)
     assert isinstance(agent.errors[0], AuthenticationError)
     assert master.links == master.proofs == []
+
+
+def test_a_master_without_the_operators_signature_gets_no_agent(site: Site, key: WarmKey) -> None:
+    forged = key.unsigned()
+    forged._proof = (1).to_bytes(8, "big") + bytes(signatures.SIGNATURE_SIZE)
+    listener, master = site.listener(credentials=forged)
+    agent = dial(site, listener.address, key.agent("warm-1", "77"))
+    agent.wait(lambda: agent.errors)
+    assert "it cannot prove that it is this pool's master" in str(agent.errors[0])
+    assert master.links == []
