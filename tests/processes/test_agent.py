@@ -9,6 +9,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from functools import partial
 from multiprocessing import spawn
 from pathlib import Path
 from typing import Any
@@ -232,6 +233,10 @@ def test_descriptors_travel_however_many_and_none_stays(shared: Agent) -> None:
     assert census.wait_until(lambda: len(os.listdir("/proc/self/fd")) <= before, PATIENCE)
 
 
+def is_gone(pid: int) -> bool:
+    return census.read(pid) is None
+
+
 @pytest.mark.slow
 def test_the_death_of_the_zygote_is_the_death_of_its_children(own: Agent) -> None:
     children = [begin(own, run_forever) for _ in range(3)]
@@ -243,7 +248,7 @@ def test_the_death_of_the_zygote_is_the_death_of_its_children(own: Agent) -> Non
         assert report.exitcode == -signal.SIGKILL
         assert "together with its zygote" in report.reason
         assert child.pid is not None
-        assert census.wait_until(lambda pid=child.pid: census.read(pid) is None, PATIENCE)
+        assert census.wait_until(partial(is_gone, child.pid), PATIENCE)
     _, observer = begin(own, os._exit, 0)  # and a new one serves what comes next
     assert observer.wait_for_exit().exitcode == 0
 

@@ -48,7 +48,8 @@ def run(agent: Agent, archive: Blob, method: str = "fork") -> int:
     """The exit status of a child that runs it."""
     options = {"program": archive, "preparation": {"program": PATHS}, "method": method}
     _, observer = begin(agent, runpy.run_path, "main.py", **options)
-    return observer.wait_for_exit().exitcode
+    status: int = observer.wait_for_exit().exitcode
+    return status
 
 
 def zygotes(agent: Agent) -> int:

@@ -12,6 +12,7 @@ import pytest
 
 import fiber
 from census import wait_until
+from fiber import queues
 from fiber.managers import AsyncBaseProxy, AsyncManager, AsyncProxyResult, RemoteError
 from patience import PATIENCE
 
@@ -224,7 +225,8 @@ def add_in_a_child(desk: Any, results: Any) -> None:
 
 
 def test_proxies_go_to_other_processes(manager: Any) -> None:
-    desk, results = manager.Desk(), fiber.SimpleQueue()
+    desk: Any = manager.Desk()
+    results: queues.SimpleQueue[int] = fiber.SimpleQueue()
     child = fiber.Process(target=add_in_a_child, args=(desk, results))
     child.start()
     assert results.get() == 10
@@ -269,7 +271,7 @@ def test_an_interruption_loses_no_other_result(
 
 def test_an_async_manager_serves_no_other_programs() -> None:
     with pytest.raises(ValueError, match="use BaseManager"):
-        DeskManager(("127.0.0.1", 0))
+        DeskManager(("127.0.0.1", 0))  # type: ignore[arg-type]  # an address is refused
     with pytest.raises(ValueError, match="use BaseManager"):
         DeskManager(serializer="xmlrpclib")
 

@@ -14,7 +14,6 @@ import pytest
 import census
 import fiber
 from fiber import reduction
-from fiber._agent import service
 from fiber._agent.service import BlobLacking, BlobStore
 from fiber._backends.remote import BlobSender
 from fiber._runtime import state
@@ -38,7 +37,7 @@ class Sent:
         self.leaving: list[Callable[[], None] | None] = []
         self.ready: list[str] = []
         """Callers whose blobs have left."""
-        self.parcels = BlobSender(self.loop, self.send)  # type: ignore[arg-type]
+        self.parcels = BlobSender(self.loop, self.send)
 
     def send(
         self, message: messages.LinkMessage, on_left: Callable[[], None] | None = None
@@ -150,7 +149,7 @@ def test_a_store_without_room_says_so_once_and_keeps_the_next(
         raise OSError(28, "No space left on device")
 
     store, message = BlobStore(str(tmp_path)), messages.KeepBlob(Blob(b"x").digest, b"x")
-    monkeypatch.setattr(service.Blob, "in_file", full)
+    monkeypatch.setattr(Blob, "in_file", full)
     store.put(message)
     with pytest.raises(BlobLacking, match="No space left on device") as caught:
         store.get(message.digest)

@@ -79,8 +79,14 @@ def test_a_window_outside_is_refused(window: tuple[int, ...]) -> None:
 
 def test_anything_with_a_buffer_is_bytes() -> None:
     one, other = Pipe()
-    for thing in (bytearray(b"abcd"), memoryview(b"abcd"), array("i", [1, 2]), np.ones((2, 3))):
-        one.send_bytes(thing)  # type: ignore[arg-type]
+    things: list[Any] = [
+        bytearray(b"abcd"),
+        memoryview(b"abcd"),
+        array("i", [1, 2]),
+        np.ones((2, 3)),
+    ]
+    for thing in things:
+        one.send_bytes(thing)
         assert other.recv_bytes() == bytes(memoryview(thing).cast("B"))
 
 
@@ -116,7 +122,8 @@ def test_receiving_into_a_buffer(
 
 def test_an_object_can_be_received_as_bytes_and_bytes_as_an_object() -> None:
     one, other = Pipe()
-    for item in ({"a": 1}, np.arange(5), np.arange(100_000)):
+    items: list[Any] = [{"a": 1}, np.arange(5), np.arange(100_000)]
+    for item in items:
         sender = threading.Thread(target=one.send, args=(item,))
         sender.start()
         assert np.array_equal(pickle.loads(other.recv_bytes()), item)
@@ -154,7 +161,7 @@ def test_a_bulky_message_waits_for_its_reader() -> None:
 
 
 def test_a_thousand_pipes() -> None:
-    pipes = [Pipe() for _ in range(200)]
+    pipes: list[tuple[Any, Any]] = [Pipe() for _ in range(200)]
     for number, (one, _) in enumerate(pipes):
         one.send(number)
     assert len(wait([other for _, other in pipes], PATIENCE)) == 200
@@ -255,11 +262,12 @@ def test_wait_mixes_connections_and_sentinels() -> None:
     ready = fiber.Event()
     process = start(hold, other, ready)
     assert ready.wait(PATIENCE)
-    assert wait([one, process.sentinel], 0) == []
+    objects: list[Any] = [one, process.sentinel]
+    assert wait(objects, 0) == []
     process.kill()
-    assert wait([one, process.sentinel], PATIENCE) == [process.sentinel]
+    assert wait(objects, PATIENCE) == [process.sentinel]
     other.close()
-    assert set(wait([one, process.sentinel], PATIENCE)) == {one, process.sentinel}
+    assert set(wait(objects, PATIENCE)) == {one, process.sentinel}
     process.join(PATIENCE)
 
 

@@ -8,7 +8,7 @@ import os
 import subprocess
 import sys
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
@@ -138,7 +138,8 @@ def test_cpu_count_and_loggers_are_reached_through_a_context() -> None:
     spawn = fiber.get_context("spawn")
     assert spawn.cpu_count() >= 1
     assert spawn.get_logger() is multiprocessing.get_logger()
-    assert spawn.freeze_support() is None
+    freeze_support: Callable[[], object] = spawn.freeze_support
+    assert freeze_support() is None
     assert spawn.reducer.ForkingPickler is multiprocessing.reduction.ForkingPickler
 
 

@@ -47,9 +47,8 @@ def test_a_future_is_concurrent_futures(executor: fiber.Executor) -> None:
 
 def test_wait_and_as_completed(executor: fiber.Executor, tmp_path: Path) -> None:
     waits = executor.submit(tasks.wait_for, tmp_path / "gate")
-    done, waiting = futures.wait(
-        [executor.submit(tasks.square, 3), waits], PATIENCE, futures.FIRST_COMPLETED
-    )
+    both: list[futures.Future[Any]] = [executor.submit(tasks.square, 3), waits]
+    done, waiting = futures.wait(both, PATIENCE, futures.FIRST_COMPLETED)
     assert ({future.result() for future in done}, waiting) == ({9}, {waits})
     (tmp_path / "gate").touch()
     assert [future.result() for future in futures.as_completed([waits], PATIENCE)] == ["gate"]
@@ -76,7 +75,7 @@ def test_callbacks_run_neither_on_the_loops_thread_nor_too_late(
     names: list[str] = []
     called = threading.Event()
 
-    def note(future: futures.Future[int]) -> None:
+    def note(future: futures.Future[Any]) -> None:
         names.append(threading.current_thread().name)
         assert future.done()
         called.set()
@@ -201,7 +200,8 @@ def test_shutdown_can_cancel_waiting_calls(tmp_path: Path) -> None:
     wait_until(lambda: sum(future.cancelled() for future in rest) >= 18, "most are cancelled")
     gate.touch()
     executor.shutdown()
-    assert all(future.done() for future in [first, *rest])
+    started: list[futures.Future[Any]] = [first, *rest]
+    assert all(future.done() for future in started)
     with pytest.raises(futures.CancelledError):
         list(results)
 
@@ -249,7 +249,7 @@ def test_map_reads_no_more_than_its_buffer(executor: fiber.Executor) -> None:
             read.append(n)
             yield n
 
-    results = executor.map(tasks.square, numbers(), buffersize=4)
+    results: Any = executor.map(tasks.square, numbers(), buffersize=4)
     assert [next(results) for _ in range(3)] == [0, 1, 4]
     assert len(read) <= 8
     results.close()
@@ -273,7 +273,7 @@ def test_map_keeps_no_result(executor: fiber.Executor) -> None:
 @pytest.mark.parametrize("wrong", [{"chunksize": 0}, {"buffersize": 0}, {"chunksize": -1}])
 def test_map_refuses_invalid_options(executor: fiber.Executor, wrong: dict[str, int]) -> None:
     with pytest.raises(ValueError, match=r"1\+"):
-        executor.map(tasks.square, [1], **wrong)  # type: ignore[arg-type]
+        executor.map(tasks.square, [1], **wrong)
 
 
 @pytest.mark.parametrize("wrong", [(5,), ([1], 5), (5, [1]), (None,)])
@@ -438,7 +438,7 @@ def test_a_task_that_comes_while_it_is_shut_down(
     wait_until(lambda: engine._scheduler.closing, "it takes nothing more")
     with pytest.raises(RuntimeError, match="cannot schedule new futures after shutdown"):
         executor.submit(tasks.square, 2)
-    late = CallFuture(engine, CallQueue())
+    late: CallFuture[Any] = CallFuture(engine, CallQueue())
     engine.calls.put(Call("late", b"", [], None, late))
     assert "after shutdown" in str(late.exception(PATIENCE))
 

@@ -182,7 +182,12 @@ def test_a_receiver_that_dies_before_its_answer_takes_no_place(
     assert wait_until(asks, PATIENCE)
     _, down = wires
     done = threading.Event()
-    hosts.on_loop(lambda: (down.hold(), done.set()))
+
+    def hold() -> None:
+        down.hold()
+        done.set()
+
+    hosts.on_loop(hold)
     assert done.wait(PATIENCE)
     if put:
         assert queue.get() == "first"

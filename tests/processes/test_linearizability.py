@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 import fiber
+from fiber import queues
 from hosts import Far, Hosts, background
 from linearizability import Operation, call, is_linearizable, queue, semaphore
 from patience import PATIENCE
@@ -44,7 +45,8 @@ def use_queue(shared: Any, seed: int, start: Any, histories: Any) -> None:
 
 def history(target: Callable[..., None], shared: Any) -> list[Operation]:
     """Return the operations of some processes."""
-    start, histories = fiber.Barrier(PROCESSES), fiber.Queue()
+    start = fiber.Barrier(PROCESSES)
+    histories: queues.Queue[list[tuple[Any, ...]]] = fiber.Queue()
     processes = [
         fiber.Process(target=target, args=(shared, seed, start, histories))
         for seed in range(PROCESSES)

@@ -24,6 +24,7 @@ import census
 import fiber
 from fiber import config
 from fiber._agent.interface import ChildSpec
+from fiber._agent.zygote_process import interpreter_arguments
 from fiber._backends import loopback
 from fiber._backends.remote import RemoteAgent, RemoteChild
 from fiber._engine import start_failures
@@ -173,7 +174,7 @@ def test_a_killed_agent_ends_its_processes_and_is_replaced_under_a_new_name() ->
     with running() as backend:
         child = start()
         pid = child.pid
-        os.kill(backend._slots[0].process.pid, signal.SIGKILL)
+        os.kill(backend._slots[0].process.pid, signal.SIGKILL)  # type: ignore[arg-type]  # it runs
         child.join(PATIENCE)
         assert child.exitcode == -signal.SIGKILL
         assert "agent loopback-0 lost" in child._popen.report.reason
@@ -187,7 +188,7 @@ def test_a_killed_agent_ends_its_processes_and_is_replaced_under_a_new_name() ->
 def test_agents_that_die_before_they_join_are_an_error_until_one_joins(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    dies, works = [sys.executable, "-c", "raise SystemExit(3)"], loopback.interpreter_arguments
+    dies, works = [sys.executable, "-c", "raise SystemExit(3)"], interpreter_arguments
     broken = True
     monkeypatch.setattr(
         loopback, "interpreter_arguments", lambda *them: dies if broken else works(*them)
@@ -232,7 +233,7 @@ def gate_second_agent(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
         assert next(numbers) != 1 or goes_on.wait(PATIENCE)
         return popen(*args, **options)
 
-    monkeypatch.setattr(loopback.subprocess, "Popen", start_one)
+    monkeypatch.setattr(subprocess, "Popen", start_one)
     return goes_on
 
 
@@ -283,8 +284,8 @@ def test_an_agent_that_cannot_be_replaced_at_once_is_replaced_later_and_that_is_
     with running() as backend:
         child = start()
         reluctant = Reluctant(2, errno.EAGAIN)
-        monkeypatch.setattr(loopback.subprocess, "Popen", reluctant)
-        os.kill(backend._slots[0].process.pid, signal.SIGKILL)  # type: ignore[arg-type]
+        monkeypatch.setattr(subprocess, "Popen", reluctant)
+        os.kill(backend._slots[0].process.pid, signal.SIGKILL)  # type: ignore[arg-type]  # it runs
         child.join(PATIENCE)
         assert child.exitcode == -signal.SIGKILL, "its end is reported in any case"
         another = start()
@@ -320,7 +321,7 @@ def test_a_system_that_starts_no_agents_is_not_asked_for_minutes(
 ) -> None:
     monkeypatch.setattr(start_failures, "KILLED_PATIENCE", 0.0)
     monkeypatch.setattr(loopback, "_LAUNCHING", 0.0)
-    monkeypatch.setattr(loopback.subprocess, "Popen", Reluctant(1000, errno.EMFILE))
+    monkeypatch.setattr(subprocess, "Popen", Reluctant(1000, errno.EMFILE))
     with running(), pytest.raises(StartError, match="Too many open files"):
         stop(start())
 
@@ -335,8 +336,8 @@ def test_the_loop_does_not_wait_for_a_process_to_start(monkeypatch: pytest.Monke
             assert goes_on.wait(PATIENCE)
             return popen(*args, **options)
 
-        monkeypatch.setattr(loopback.subprocess, "Popen", slow)
-        os.kill(backend._slots[0].process.pid, signal.SIGKILL)  # type: ignore[arg-type]
+        monkeypatch.setattr(subprocess, "Popen", slow)
+        os.kill(backend._slots[0].process.pid, signal.SIGKILL)  # type: ignore[arg-type]  # it runs
         assert census.wait_until(lambda: backend._slots[0].name != "loopback-0", PATIENCE)
         turned = threading.Event()
         backend._loop.call_soon(turned.set)
@@ -370,7 +371,7 @@ def test_an_agent_that_cannot_be_watched_is_ended_before_the_next_attempt(
 def test_an_agent_that_can_never_be_started_is_an_error_with_the_cause(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(loopback.subprocess, "Popen", Reluctant(999, errno.ENOEXEC))
+    monkeypatch.setattr(subprocess, "Popen", Reluctant(999, errno.ENOEXEC))
     with running(), pytest.raises(StartError, match="none joined") as caught:
         start()
     assert "its process cannot be started: [Errno 8]" in str(caught.value)
@@ -383,8 +384,8 @@ def test_while_another_agent_is_there_no_place_is_given_up(
     monkeypatch.setattr(start_failures, "SAID_AFTER", 0.0)
     with running(agents=2) as backend:
         assert census.wait_until(lambda: len(backend.agents.agents) == 2, PATIENCE)
-        monkeypatch.setattr(loopback.subprocess, "Popen", Reluctant(4, errno.ENOEXEC))
-        os.kill(backend._slots[0].process.pid, signal.SIGKILL)  # type: ignore[arg-type]
+        monkeypatch.setattr(subprocess, "Popen", Reluctant(4, errno.ENOEXEC))
+        os.kill(backend._slots[0].process.pid, signal.SIGKILL)  # type: ignore[arg-type]  # it runs
         assert census.wait_until(lambda: backend._failures.count >= TRIES, PATIENCE)
         child = start()  # on the other one
         assert child._popen._child.host == "loopback-1"

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing import AuthenticationError
 from pathlib import Path
@@ -21,6 +21,7 @@ import pytest
 
 import fiber
 from census import wait_until
+from fiber import queues
 from fiber._managers.client import CallChannel, session
 from fiber._runtime.state import runtime
 from fiber.managers import AcquirerProxy, BaseManager, RemoteError, SyncManager
@@ -96,7 +97,7 @@ def test_proxies_go_where_anything_goes(manager: Any) -> None:
     with fiber.Pool(1) as pool:
         assert pool.apply(double, (shared, "a")) == 2
         assert pool.map(len, [shared, manager.list("abc")]) == [1, 3]
-    local = fiber.SimpleQueue()
+    local: queues.SimpleQueue[Any] = fiber.SimpleQueue()
     local.put(shared)
     assert local.get()["a"] == 2
 
@@ -127,6 +128,7 @@ def step(counter: Any) -> None:
 
 
 class CounterManager(BaseManager):
+    Counter: Callable[..., Any]
     pass
 
 
@@ -278,6 +280,8 @@ def pass_through(lock: Any) -> None:
 
 
 class LockManager(BaseManager):
+    Lock: Callable[[], Any]
+    Plain: Callable[[], Any]
     pass
 
 
@@ -393,6 +397,7 @@ class Slow:
 
 
 class SlowManager(SyncManager):
+    Slow: Callable[[], Any]
     pass
 
 
@@ -514,6 +519,7 @@ def test_another_program_connects_by_address_and_key(module: str, tmp_path: Path
     script = tmp_path / "program.py"
     script.write_text(PROGRAM.replace("MODULE", module))
     with CounterManager(("127.0.0.1", 0), authkey=b"open sesame") as manager:
+        assert isinstance(manager.address, tuple)
         port = str(manager.address[1])
         command = [sys.executable, str(script), port]
         done = subprocess.run([*command, "open sesame"], capture_output=True)
@@ -524,7 +530,7 @@ def test_another_program_connects_by_address_and_key(module: str, tmp_path: Path
 
 
 def test_a_server_can_run_in_the_program_itself() -> None:
-    server = CounterManager().get_server()
+    server: Any = CounterManager().get_server()
     background(server.accepter)
     manager = CounterManager(server.address)
     manager.connect()
@@ -575,7 +581,7 @@ def test_a_manager_that_is_collected_on_the_loop_thread_ends_too() -> None:
 def test_the_process_of_a_manager_has_the_resources_of_its_class_and_callables() -> None:
     @fiber.meta(memory=512)
     class Manager(BaseManager):
-        pass
+        Large: Callable[[int], Any]
 
     Manager.register("Small", fiber.meta(cpu=1)(make_counter))
     Manager.register("Large", fiber.meta(cpu=4, memory=100)(make_counter))

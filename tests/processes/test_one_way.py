@@ -25,7 +25,8 @@ from fiber._hub.queue_delivery import Dealer
 from fiber._transport import channels
 from fiber._wire import packet
 from fiber.errors import ConnectionClosed
-from hosts import PATIENCE, Far, background
+from hosts import Far, background
+from patience import PATIENCE
 
 SIZES = (0, 1, 40, 100, 1000, 10_000, 60_000)
 MORE_THAN_A_SOCKET = 1000
@@ -244,7 +245,8 @@ def test_a_reader_of_another_host_finds_an_unannounced_message(
     sleep: str, far: Far, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     reader, writer = fiber.Pipe(duplex=False)
-    there, sender = far(reader), writer._channel
+    there: Any = far(reader)
+    sender: Any = writer._channel
     answers: list[object] = []
     ways: dict[str, Callable[[], object]] = {
         "recv": there.recv_bytes,
@@ -299,7 +301,12 @@ def test_the_end_comes_after_the_backlog(ends: Ends) -> None:
 def test_a_full_channel_makes_its_sender_wait_and_then_go_on(ends: Ends) -> None:
     receiver, sender = ends
     count = filled(lambda: sender.try_send(b"x" * 40))
-    more = background(lambda: [sender.send(b"y" * 40) for _ in range(count)])
+
+    def send_more() -> None:
+        for _ in range(count):
+            sender.send(b"y" * 40)
+
+    more = background(send_more)
     got = [receiver.recv().tobytes() for _ in range(2 * count)]
     more.join(PATIENCE)
     assert got == [b"x" * 40] * count + [b"y" * 40] * count
@@ -448,12 +455,12 @@ def test_a_process_killed_within_the_backlog_leaves_it_to_others() -> None:
 
 def test_threads_keep_their_own_order() -> None:
     receiver, sender = local.one_way_pair()
-    writers = [
-        threading.Thread(
-            target=lambda who=who: [sender.send(b"%d %d" % (who, n)) for n in range(2000)]
-        )
-        for who in range(4)
-    ]
+
+    def send_all(who: int) -> None:
+        for number in range(2000):
+            sender.send(b"%d %d" % (who, number))
+
+    writers = [threading.Thread(target=send_all, args=(who,)) for who in range(4)]
     for writer in writers:
         writer.start()
     taken = [receiver.recv().tobytes().split() for _ in range(4 * 2000)]

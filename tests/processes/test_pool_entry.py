@@ -470,7 +470,7 @@ def test_a_runtime_whose_making_was_interrupted_leaves_no_thread(
         raise Stop
 
     state.shutdown()
-    monkeypatch.setattr(state.util, "Finalize", interrupt)
+    monkeypatch.setattr(util, "Finalize", interrupt)
     with pytest.raises(Stop):
         runtime()
     monkeypatch.undo()

@@ -232,7 +232,7 @@ class Unreadable:
 )
 def test_the_error_of_an_unpicklable_task_reaches_its_callback_from_the_loop_thread(
     pool: Pool,
-    ask: Callable[[Pool, Callable[[Any], None]], AsyncResult],
+    ask: Callable[[Pool, Callable[[Any], None]], AsyncResult[Any]],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """So that the callbacks' thread is started, used and stopped by one thread."""

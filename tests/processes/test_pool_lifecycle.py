@@ -13,13 +13,15 @@ import threading
 import time
 import warnings
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import fiber
 from fiber.process import PoolProcess
+from fiber.results import ApplyResult
 from patience import PATIENCE
 from processes import pool_tasks as tasks
 from processes.pool_programs import ENVIRON, is_alive, run_program, wait_until
@@ -72,10 +74,18 @@ def test_a_closed_pool_accepts_no_call() -> None:
     pool = fiber.Pool(1)
     pool.close()
     pool.close()
-    for call in (pool.map, pool.map_async, pool.imap, pool.imap_unordered, pool.starmap):
+    calls: list[Callable[..., object]] = [
+        pool.map,
+        pool.map_async,
+        pool.imap,
+        pool.imap_unordered,
+        pool.starmap,
+    ]
+    for call in calls:
         with pytest.raises(ValueError, match="Pool not running"):
             call(tasks.square, [(1,)])
-    for call in (pool.apply, pool.apply_async, pool.broadcast):
+    calls = [pool.apply, pool.apply_async, pool.broadcast]
+    for call in calls:
         with pytest.raises(ValueError, match="Pool not running"):
             call(tasks.square)
     with pytest.raises(ValueError, match="Pool not running"), pool:
@@ -100,7 +110,8 @@ def test_terminate_is_prompt_and_ends_every_wait() -> None:
     pool.terminate()
     pool.join()
     assert not any(is_alive(pid) for pid in pids)
-    for result in [*results, mapped]:
+    every: list[ApplyResult[Any]] = [*results, mapped]
+    for result in every:
         with pytest.raises(fiber.FiberError, match="terminated"):
             result.get(PATIENCE)
         assert not result.successful()

@@ -103,7 +103,9 @@ def test_all_in_one_chunk(pool: Pool, size: int) -> None:
 
 
 def test_numbers_may_be_numpys(pool: Pool) -> None:
-    assert pool.map(tasks.square, range(4), np.int64(2), timeout=np.float32(9)) == [0, 1, 4, 9]
+    size: Any = np.int64(2)
+    timeout: Any = np.float32(9)
+    assert pool.map(tasks.square, range(4), size, timeout=timeout) == [0, 1, 4, 9]
 
 
 def test_a_timeout_says_how_long_it_waited(pool: Pool, tmp_path: Path) -> None:

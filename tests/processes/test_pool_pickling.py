@@ -25,6 +25,10 @@ class Asking:
         return int, (self._ask(),)
 
 
+absolute: Callable[[Any], Any] = abs
+"""An item is a number only once it has travelled."""
+
+
 def end(pool: Pool) -> None:
     pool.close()
     pool.join()
@@ -46,7 +50,7 @@ WAITS: dict[str, Callable[[Pool], Any]] = {
 @pytest.mark.parametrize("ask", WAITS.values(), ids=WAITS.keys())
 def test_a_wait_for_the_same_pool_is_refused(ask: Callable[[Pool], Any]) -> None:
     with fiber.Pool(1) as pool:
-        found = pool.map_async(abs, [Asking(lambda: ask(pool))])
+        found = pool.map_async(absolute, [Asking(lambda: ask(pool))])
         with pytest.raises(RuntimeError, match="cannot wait for a result of the same pool"):
             found.get(PATIENCE)
     pool.join()
@@ -56,13 +60,13 @@ def test_the_pickling_thread_may_get_a_result_that_is_ready() -> None:
     with fiber.Pool(1) as pool:
         result = pool.apply_async(abs, (-1,))
         result.wait(PATIENCE)
-        assert pool.map_async(abs, [Asking(result.get)]).get(PATIENCE) == [1]
+        assert pool.map_async(absolute, [Asking(result.get)]).get(PATIENCE) == [1]
     pool.join()
 
 
 def test_another_pool_may_be_waited_for() -> None:
     with fiber.Pool(1) as pool, fiber.Pool(1) as other:
-        found = pool.map_async(abs, [Asking(lambda: other.apply(abs, (-1,)))])
+        found = pool.map_async(absolute, [Asking(lambda: other.apply(abs, (-1,)))])
         assert found.get(PATIENCE) == [1]
     pool.join()
     other.join()
@@ -76,7 +80,7 @@ def test_a_pool_may_be_terminated_while_another_worker_waits_to_be_started() -> 
             wait_until(lambda: len(members) == 2, "another worker is wanted")
             pool.terminate()
 
-        found = pool.map_async(abs, [Asking(terminate), 1])
+        found = pool.map_async(absolute, [Asking(terminate), 1])
         with pytest.raises(FiberError, match="terminated"):
             found.get(PATIENCE)
     pool.join()

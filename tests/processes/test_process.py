@@ -98,7 +98,7 @@ def test_a_lambda_and_a_closure_can_be_targets(pipe: tuple[Any, Any]) -> None:
     child.join()
 
 
-@pytest.mark.parametrize("target", [threading.Lock(), (item for item in ())])
+@pytest.mark.parametrize("target", [threading.Lock(), (item for item in "")])
 def test_an_unpicklable_argument_is_refused_at_the_start_and_leaks_no_file(
     target: Any, pipe: tuple[Any, Any]
 ) -> None:
@@ -185,7 +185,7 @@ def test_a_start_drops_the_children_that_ended(pipe: tuple[Any, Any]) -> None:
     ended.start()
     here.send("end")  # not before: one that ends within its start is dropped by that
     ended._popen.wait(PATIENCE)
-    assert ended in multiprocessing.process._children
+    assert ended in vars(multiprocessing.process)["_children"]
     reference = weakref.ref(ended)
     del ended
     another = fiber.Process(target=os.getpid)
@@ -199,15 +199,15 @@ def test_a_child_that_ends_before_its_start_returns_is_dropped(
 ) -> None:
     wait_for_birth = popen.Popen._wait_for_answer
 
-    def wait_for_end(self: popen.Popen, host: str) -> None:
-        wait_for_birth(self, host)
+    def wait_for_end(self: popen.Popen, handle: Any) -> None:
+        wait_for_birth(self, handle)
         self.wait(PATIENCE)
         process._drop_ended()
 
     monkeypatch.setattr(popen.Popen, "_wait_for_answer", wait_for_end)
     child = fiber.Process(target=os.getpid)
     child.start()
-    assert child not in multiprocessing.process._children
+    assert child not in vars(multiprocessing.process)["_children"]
 
 
 @pytest.mark.parametrize("round_", range(5))

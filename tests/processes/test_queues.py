@@ -45,7 +45,7 @@ class Unpicklable:
 
 
 def test_size_is_right_as_soon_as_put_returns() -> None:
-    queue = fiber.Queue()
+    queue: queues.Queue[Any] = fiber.Queue()
     assert queue.qsize() == 0
     assert queue.empty()
     queue.put(1)
@@ -58,7 +58,7 @@ def test_size_is_right_as_soon_as_put_returns() -> None:
 
 def test_a_place_that_is_given_back_twice_is_removed() -> None:
     """Interrupt a put after its item has left."""
-    queue = fiber.Queue(2)
+    queue: queues.Queue[int] = fiber.Queue(2)
     queue.put(1)
     queue._slots.give_back()
     assert queue.get() == 1
@@ -71,7 +71,8 @@ def test_a_place_that_is_given_back_twice_is_removed() -> None:
 
 def test_an_interrupted_get_frees_the_place_of_its_item() -> None:
     queue: Any = fiber.Queue(1)
-    files = {module.__file__ for module in (queues, queue_delivery, local, packet)}
+    modules = (queues, queue_delivery, local, packet)
+    files = {str(module.__file__) for module in modules}
     for stop in itertools.count():
         queue.put(1)
         interrupted = is_interrupted(queue.get, stop, files, steps=INSTRUCTIONS)
@@ -85,7 +86,7 @@ def test_an_interrupted_get_frees_the_place_of_its_item() -> None:
 
 @pytest.mark.parametrize("maxsize", [0, -1])
 def test_without_a_positive_maxsize_it_is_never_full(maxsize: int) -> None:
-    queue = fiber.Queue(maxsize)
+    queue: queues.Queue[int] = fiber.Queue(maxsize)
     for number in range(MORE_THAN_FITS):
         queue.put(number, block=False)
     assert not queue.full()
@@ -93,7 +94,7 @@ def test_without_a_positive_maxsize_it_is_never_full(maxsize: int) -> None:
 
 
 @pytest.mark.parametrize("kind", [fiber.Queue, fiber.JoinableQueue])
-def test_a_closed_queue_refuses(kind: Callable[[], queues.Queue]) -> None:
+def test_a_closed_queue_refuses(kind: Callable[[], queues.Queue[int]]) -> None:
     queue = kind()
     with pytest.raises(AssertionError, match="not closed"):
         queue.join_thread()
@@ -107,7 +108,7 @@ def test_a_closed_queue_refuses(kind: Callable[[], queues.Queue]) -> None:
 
 
 def test_more_than_the_socket_holds_waits_in_order() -> None:
-    queue = fiber.Queue()
+    queue: queues.Queue[Any] = fiber.Queue()
     for number in range(MORE_THAN_FITS):
         queue.put(number)
     assert [queue.get() for _ in range(MORE_THAN_FITS)] == list(range(MORE_THAN_FITS))
@@ -165,7 +166,7 @@ def test_the_unpicklable_part_of_an_item_is_named(capsys: pytest.CaptureFixture[
 def test_the_hook_for_errors_can_be_overridden() -> None:
     reported = []
 
-    class Watched(queues.Queue):
+    class Watched(queues.Queue[Unpicklable]):
         @staticmethod
         def _on_queue_feeder_error(e: Exception, obj: Any) -> None:
             reported.append((e, obj))
@@ -226,7 +227,7 @@ def test_classes_take_item_types() -> None:
 
 
 def test_join_thread_does_not_wait_for_items_without_a_reader() -> None:
-    queue = fiber.Queue()
+    queue: queues.Queue[Any] = fiber.Queue()
     for _ in range(MORE_THAN_FITS):
         queue.put(b"x" * 100)
     queue.close()
@@ -235,7 +236,7 @@ def test_join_thread_does_not_wait_for_items_without_a_reader() -> None:
 
 def test_a_forgotten_queue_leaves_no_thread() -> None:
     before = threading.active_count()
-    queue = fiber.Queue()
+    queue: queues.Queue[Any] = fiber.Queue()
     for _ in range(MORE_THAN_FITS):
         queue.put(1)
     assert threading.active_count() > before
@@ -290,7 +291,8 @@ def test_a_process_that_may_not_waits_until_they_are_read() -> None:
 
 @pytest.mark.slow
 def test_many_processes_put_and_get_at_once() -> None:
-    items, answers = fiber.Queue(100), fiber.Queue()
+    items: queues.Queue[Any] = fiber.Queue(100)
+    answers: queues.Queue[tuple[int, int]] = fiber.Queue()
     getters = [start(get_all, items, answers) for _ in range(2)]
     putters = [start(put_all, items, 5000 * n, 5000) for n in range(2)]
     got = [answers.get(timeout=PATIENCE) for _ in range(10_000)]
@@ -311,7 +313,8 @@ def send_back(inbox: Any, outbox: Any) -> None:
 
 
 def test_large_items_pass() -> None:
-    there, back = fiber.Queue(), fiber.Queue()
+    there: queues.Queue[Any] = fiber.Queue()
+    back: queues.Queue[Any] = fiber.Queue()
     process = start(send_back, there, back)
     item = {"text": "x" * 3_000_000, "array": np.arange(500_000)}
     for _ in range(3):
@@ -330,7 +333,8 @@ def announce_and_get(queue: Any, ready: Any) -> None:
 
 
 def test_a_reader_killed_while_it_waits_takes_no_item() -> None:
-    queue, ready = fiber.Queue(1), fiber.Event()
+    queue: queues.Queue[Any] = fiber.Queue(1)
+    ready = fiber.Event()
     for _ in range(3):
         process = start(announce_and_get, queue, ready)
         assert ready.wait(PATIENCE)
@@ -465,7 +469,7 @@ def test_an_unpicklable_item_does_not_count_as_an_unfinished_task(
 
 
 def test_a_simple_queue() -> None:
-    queue = fiber.SimpleQueue()
+    queue: queues.SimpleQueue[Any] = fiber.SimpleQueue()
     assert queue.empty()
     queue.put([1])
     assert not queue.empty()
@@ -481,7 +485,8 @@ def test_a_simple_queue() -> None:
 
 
 def test_a_simple_queue_among_processes() -> None:
-    there, back = fiber.SimpleQueue(), fiber.SimpleQueue()
+    there: queues.SimpleQueue[Any] = fiber.SimpleQueue()
+    back: queues.SimpleQueue[Any] = fiber.SimpleQueue()
     process = start(send_back, there, back)
     for item in (1, "x" * 2_000_000):
         there.put(item)

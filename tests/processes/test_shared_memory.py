@@ -36,22 +36,27 @@ def run(target: Callable[..., Any], *args: Any) -> None:
     assert process.exitcode == 0
 
 
+def buffer(memory: SharedMemory) -> memoryview:
+    assert memory.buf is not None
+    return memory.buf
+
+
 def write(memory: SharedMemory) -> None:
-    memory.buf[:3] = b"abc"
+    buffer(memory)[:3] = b"abc"
 
 
 def write_by_name(name: str) -> None:
     memory = SharedMemory(name)
-    memory.buf[3:6] = b"def"
+    buffer(memory)[3:6] = b"def"
     memory.close()
 
 
 def make(name: str) -> None:
     memory = SharedMemory(name, create=True, size=10)
-    memory.buf[0] = 7
+    buffer(memory)[0] = 7
 
 
-def double(numbers: ShareableList) -> None:
+def double(numbers: ShareableList[int]) -> None:
     numbers[0] *= 2
 
 
@@ -62,13 +67,13 @@ def there_is(name: str) -> bool:
 def test_processes_find_it_by_name_and_as_an_argument(memory: SharedMemory) -> None:
     run(write, memory)
     run(write_by_name, memory.name)
-    assert bytes(memory.buf[:6]) == b"abcdef"
+    assert bytes(buffer(memory)[:6]) == b"abcdef"
 
 
 def test_shared_memory_is_an_instance_of_multiprocessings_class(memory: SharedMemory) -> None:
     theirs = multiprocessing.shared_memory.SharedMemory
     assert isinstance(memory, theirs)
-    memory.buf[0] = 5
+    buffer(memory)[0] = 5
     again = pickle.loads(pickle.dumps(memory))
     assert (again.buf[0], again.name, again.size) == (5, memory.name, memory.size)
 
@@ -77,7 +82,7 @@ def test_shared_memory_outlives_the_process_that_made_it() -> None:
     name = f"fiber-test-{os.getpid()}"
     run(make, name)
     memory = SharedMemory(name)
-    assert memory.buf[0] == 7
+    assert buffer(memory)[0] == 7
     memory.close()
     memory.unlink()
     assert not there_is(name)
@@ -101,13 +106,15 @@ def test_bad_options(options: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("name", [5, 0, b"name", ["name"]])
 def test_an_invalid_name_is_refused(name: Any) -> None:
-    for options in ({}, {"create": True, "size": 5}):
+    every: list[dict[str, Any]] = [{}, {"create": True, "size": 5}]
+    for options in every:
         with pytest.raises(TypeError, match="'name' must be a string, not"):
             SharedMemory(name, **options)
 
 
 def test_a_list_is_shared() -> None:
-    numbers = ShareableList([21, "text", None, b"bytes"])
+    kind: Any = ShareableList  # typeshed knows no list of several types, and no iteration
+    numbers = kind([21, "text", None, b"bytes"])
     run(double, numbers)
     assert list(numbers) == [42, "text", None, b"bytes"]
     assert isinstance(numbers, multiprocessing.shared_memory.ShareableList)
@@ -120,9 +127,10 @@ def test_a_manager_removes_its_shared_memory() -> None:
     with pytest.raises(ValueError, match="does not run"):
         manager.SharedMemory(size=10)
     with manager:
-        memory, numbers = manager.SharedMemory(size=10), manager.ShareableList([1, 2])
+        memory = manager.SharedMemory(size=10)
+        numbers: Any = manager.ShareableList([1, 2])  # typeshed knows no iteration
         run(write, memory)
-        assert bytes(memory.buf[:3]) == b"abc"
+        assert bytes(buffer(memory)[:3]) == b"abc"
         assert list(numbers) == [1, 2]
         names = memory.name, numbers.shm.name
         assert all(map(there_is, names))

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import fiber
-from fiber import sharedctypes
+from fiber import queues, sharedctypes
 from fiber._hub.heap import LARGE, allocate
 from patience import PATIENCE
 from unit.test_heap import SharedBytes
@@ -67,7 +67,7 @@ def test_classes_are_multiprocessings_own(made: Callable[[], Any], cls: str) -> 
 
 
 def test_a_structure_has_attributes_under_its_lock() -> None:
-    point = fiber.Value(Point, 1, 2)
+    point: Any = fiber.Value(Point, 1, 2)
     with point:
         point.x += 10
     assert (point.x, point.y) == (11, 2)
@@ -76,23 +76,26 @@ def test_a_structure_has_attributes_under_its_lock() -> None:
 
 def test_a_lock_of_ones_own() -> None:
     lock = fiber.Lock()
-    assert fiber.Value("i", 0, lock=lock).get_lock() is lock
+    guarded: Any = fiber.Value("i", 0, lock=lock)
+    assert guarded.get_lock() is lock
     assert isinstance(fiber.Value("i", 3, lock=False), ctypes.c_int)
     with pytest.raises(AttributeError, match="'yes' has no method 'acquire'"):
-        fiber.Array("i", 3, lock="yes")
+        fiber.Array("i", 3, lock="yes")  # type: ignore[call-overload]  # no lock
 
 
 def test_arrays_are_zero_or_as_given() -> None:
-    assert list(fiber.Array("i", 3)) == [0, 0, 0]
+    zeros: Any = fiber.Array("i", 3)
+    assert list(zeros) == [0, 0, 0]
     assert list(fiber.RawArray(ctypes.c_short, (1, 2))) == [1, 2]
-    assert list(fiber.RawArray("d", np.array([0.5, 1.5]))) == [0.5, 1.5]
+    halves: Any = np.array([0.5, 1.5])
+    assert list(fiber.RawArray("d", halves)) == [0.5, 1.5]
     assert list(fiber.RawArray("d", 0)) == []
     with pytest.raises(ValueError):
         fiber.RawArray("d", -1)
 
 
 def test_numpy_sees_the_memory_itself() -> None:
-    array = fiber.Array("d", 4)
+    array: Any = fiber.Array("d", 4)
     view = np.frombuffer(array.get_obj())
     view[2] = 2.5
     assert array[2] == 2.5
@@ -107,7 +110,7 @@ def test_copy_and_synchronized() -> None:
     shared = sharedctypes.copy(point)
     point.x = 5
     assert (shared.x, shared.y) == (1, 2)
-    guarded = sharedctypes.synchronized(shared)
+    guarded: Any = sharedctypes.synchronized(shared)
     with guarded.get_lock():
         guarded.x = 7
     assert shared.x == 7
@@ -151,7 +154,8 @@ def count_both(*values: Any) -> None:
 
 
 def test_arrays_travel_through_queues_and_keep_their_lock() -> None:
-    there, back = fiber.Queue(), fiber.SimpleQueue()
+    there: queues.Queue[Any] = fiber.Queue()
+    back: queues.SimpleQueue[Any] = fiber.SimpleQueue()
     process = start(pass_on, there, back)
     array = fiber.Array("i", 2)
     there.put(array)
@@ -179,7 +183,7 @@ def test_pool_initializers_get_them() -> None:
 
 
 def test_a_shared_value_outlives_the_process_that_made_it() -> None:
-    back = fiber.SimpleQueue()
+    back: queues.SimpleQueue[Any] = fiber.SimpleQueue()
     process = start(_send_new, back)
     array = back.get()
     process.join(PATIENCE)
@@ -199,7 +203,8 @@ def test_other_objects_of_the_same_types_pickle_as_before() -> None:
     assert copy.copy(Point(3, 4)).y == 4
     theirs: Any = ctypes.c_int(1)
     theirs._wrapper = object()  # where multiprocessing's have their memory
-    guarded = multiprocessing.sharedctypes.synchronized(theirs, threading.RLock())  # type: ignore[arg-type]
+    lock: Any = threading.RLock()
+    guarded = multiprocessing.sharedctypes.synchronized(theirs, lock)
     for each in (theirs, guarded):
         with pytest.raises(RuntimeError, match="through inheritance"):
             pickle.dumps(each)

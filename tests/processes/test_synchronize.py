@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 import fiber
-from fiber import synchronize
+from fiber import queues, synchronize
 from patience import PATIENCE
 from processes.test_loopback import running
 
@@ -63,7 +63,8 @@ def hold_and_fork(lock: Any, forks: Any) -> None:
 
 def test_a_fork_of_a_dead_holder_on_another_host_does_not_keep_the_lock() -> None:
     with running(agents=1):
-        lock, forks = fiber.Lock(), fiber.SimpleQueue()
+        lock = fiber.Lock()
+        forks: queues.SimpleQueue[int] = fiber.SimpleQueue()
         holder = start(hold_and_fork, lock, forks)
         fork = forks.get()
         try:
@@ -112,7 +113,8 @@ def wait_and_answer(event: Any, ready: Any, answers: Any) -> None:
 
 
 def test_an_event_wakes_all_processes() -> None:
-    event, ready, answers = fiber.Event(), fiber.Semaphore(0), fiber.Queue()
+    event, ready = fiber.Event(), fiber.Semaphore(0)
+    answers: queues.Queue[bool] = fiber.Queue()
     processes = [start(wait_and_answer, event, ready, answers) for _ in range(3)]
     for _ in processes:
         assert ready.acquire(timeout=PATIENCE)
@@ -144,7 +146,8 @@ def add(lock: Any, count: Any, times: int) -> None:
 
 
 def test_a_waiter_gets_the_lock() -> None:
-    lock, count = fiber.Lock(), fiber.SimpleQueue()
+    lock = fiber.Lock()
+    count: queues.SimpleQueue[int] = fiber.SimpleQueue()
     count.put(0)
     processes = [fiber.Process(target=add, args=(lock, count, 100)) for _ in range(3)]
     for process in processes:
@@ -155,7 +158,8 @@ def test_a_waiter_gets_the_lock() -> None:
 
 
 def test_pickled_anywhere_it_is_the_same() -> None:
-    lock, queue = fiber.RLock(), fiber.Queue()
+    lock = fiber.RLock()
+    queue: queues.Queue[Any] = fiber.Queue()
     queue.put(lock)
     with lock, queue.get(timeout=PATIENCE) as again:
         assert again

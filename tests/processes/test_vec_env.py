@@ -120,13 +120,11 @@ def test_cart_poles_in_the_wrappers_of_stable_baselines3(vec_env: Make) -> None:
     from stable_baselines3.common.vec_env import VecFrameStack, VecMonitor, VecNormalize
 
     makes = [partial(gymnasium.make, "CartPole-v1")] * 3
-    play_both(
-        *(
-            VecFrameStack(VecNormalize(VecMonitor(env), norm_reward=False), 2)
-            for env in (vec_env(makes), dummy(makes))
-        ),
-        steps=0,
+    mine, its = (
+        VecFrameStack(VecNormalize(VecMonitor(env), norm_reward=False), 2)
+        for env in (vec_env(makes), dummy(makes))
     )
+    play_both(mine, its, steps=0)
     mine, its = (VecFrameStack(VecNormalize(env), 2) for env in (vec_env(makes), dummy(makes)))
     play_both(mine, its, 60)
 

@@ -28,7 +28,7 @@ MIXED = spaces.Dict(
         "words": spaces.Text(5),
     }
 )
-SPACES = {
+SPACES: dict[str, spaces.Space[Any]] = {
     "numbers": spaces.Box(-1, 1, (), np.float64),
     "array": spaces.Box(-1, 1, (2, 3), np.float32),
     "discrete": spaces.MultiDiscrete([3, 4]),
@@ -184,9 +184,9 @@ def test_an_environment_that_cannot_be_made_or_pickled() -> None:
     with pytest.raises(LookupError, match="no simulator") as caught:
         VectorEnv([Faulty, Faulty, fail], num_workers=2)
     assert caught.value.__notes__ == ["the making of environment 2, of worker 'VectorEnv-worker-1'"]
-    generator = (each for each in ())
+    generator: Any = (each for each in "")
     with pytest.raises(fiber.UnpicklableError, match=r"environment 1, of worker '.*worker-1'"):
-        VectorEnv([Faulty, lambda: generator], num_workers=2)  # type: ignore[list-item]
+        VectorEnv([Faulty, lambda: generator], num_workers=2)
 
 
 def test_environments_are_distributed_evenly_over_the_workers(vector_env: Make) -> None:
@@ -354,11 +354,11 @@ def test_wrappers_of_gymnasium(vector_env: Make) -> None:
     same(mine, its)
     ended = 0
     for _ in range(60):
-        mine, its = (each.step(np.array([0, 1, 0])) for each in wrapped)
-        for results in (mine, its):
+        my_step, its_step = (each.step(np.array([0, 1, 0])) for each in wrapped)
+        for results in (my_step, its_step):
             results[4].get("episode", {}).pop("t", None)  # seconds
-        same(mine, its)
-        ended += "episode" in mine[4]
+        same(my_step, its_step)
+        ended += "episode" in my_step[4]
     assert ended > 3
 
 
@@ -383,7 +383,8 @@ def test_a_registered_environment_makes_fibers_vector_env(monkeypatch: pytest.Mo
     spec = gymnasium.spec("CartPole-v1")
     monkeypatch.setattr(spec, "vector_entry_point", spec.vector_entry_point)
     fiber.vector.register("CartPole-v1", num_workers=1)
-    for mode in ({}, {"vectorization_mode": "vector_entry_point"}):
+    modes: list[dict[str, Any]] = [{}, {"vectorization_mode": "vector_entry_point"}]
+    for mode in modes:
         env = gymnasium.make_vec("CartPole-v1", 2, max_episode_steps=6, **mode)
         assert isinstance(env, VectorEnv)
         assert env.get_attr("spec")[0].max_episode_steps == 6

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import random
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -51,12 +52,13 @@ class Telling(Sampling):
 
 def some_space(chance: random.Random, depth: int = 0) -> spaces.Space[Any]:
     shape = tuple(chance.randint(1, 3) for _ in range(chance.randint(0, 3)))
-    kinds = [
+    counts: list[Any] = [3, [2, 2]]
+    kinds: list[Callable[[], spaces.Space[Any]]] = [
         lambda: spaces.Box(-1, 1, shape, chance.choice(DTYPES)),
         lambda: spaces.Box(0, 100, shape, chance.choice(INTEGERS)),
         lambda: spaces.Discrete(chance.randint(1, 5), start=chance.randint(-3, 3)),
         lambda: spaces.MultiDiscrete(np.full(shape or (2,), chance.randint(1, 4))),
-        lambda: spaces.MultiBinary(chance.choice([3, [2, 2]])),
+        lambda: spaces.MultiBinary(chance.choice(counts)),
         lambda: spaces.Text(chance.randint(1, 6)),
         lambda: spaces.Graph(spaces.Box(-1, 1, (2,)), chance.choice([None, spaces.Discrete(3)])),
     ]

@@ -22,6 +22,7 @@ import pytest
 import census
 from fiber import reduction
 from fiber._agent import child, zygote, zygote_process
+from fiber._agent.child import StartRequest
 from fiber._agent.last_words import ProgressTable
 from fiber._agent.preload import Imports
 from fiber._agent.service import is_expected
@@ -81,14 +82,14 @@ class Master:
         self.process.wait(PATIENCE)
 
 
-def _start(target: Any = run_forever, args: Any = (), **options: Any) -> zygote.StartRequest:
+def _start(target: Any = run_forever, args: Any = (), **options: Any) -> StartRequest:
     process = Process(target=target, args=args)
     preparation = spawn.get_preparation_data(process.name)
     preparation |= {"authkey": b"key", "calls": [], "same_host": True}
     for key in ("start_method", "init_main_from_name", "init_main_from_path"):
         preparation.pop(key, None)
     preparation |= options.pop("preparation", {})
-    return zygote.StartRequest(
+    return StartRequest(
         name=process.name,
         host="here",
         method=options.pop("method", "fork"),
