@@ -67,7 +67,8 @@ def test_a_pod_without_rights_gets_no_word_of_a_program(
     (worker,) = workers(scene)
     (pool,) = scene.now["fiberpools"].values()
     master = pool["spec"]["master"]
-    forged = {**{key: worker["metadata"][key] for key in ("name", "uid")}, "key": "0" * 64}
+    claimed = {key: worker["metadata"][key] for key in ("name", "uid")}
+    forged = {**claimed, "key": "0" * 64, "master": master["certificate"]}
     stranger = pod(image, f"{master['host']}:{master['port']}", json.dumps(forged))
     scene.kube.create(scene.path("pods"), stranger)
     scene.wait("the stranger has ended", lambda: has_failed(scene.now["pods"].get("stranger")), 60)

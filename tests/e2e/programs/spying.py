@@ -52,7 +52,7 @@ def main() -> None:
             for form, word in _forms(key)
         }
         say("spied", **pool.apply(spy, (disguised,)))
-        say("posed", **pool.apply(pose, (uids, keys)))
+        say("posed", **pool.apply(pose, (uids, keys, credentials.fingerprint)))
         say("done", hosts=sorted(set(pool.map(host, range(8), chunksize=1)) & hosts))
 
 
@@ -137,15 +137,16 @@ def _of_process(folder: Path) -> Iterator[tuple[str, bytes]]:
                     yield str(folder / "mem"), data
 
 
-def pose(uids: Mapping[str, str], keys: Mapping[str, str]) -> dict[str, object]:
+def pose(uids: Mapping[str, str], keys: Mapping[str, str], master: str) -> dict[str, object]:
     """Dial the program as agents that this pod's is not, with all that its agent has."""
     own = socket.gethostname()
     (other,) = set(uids) - {own}
+    has = {"key": keys[own], "master": master}
     return {
         "other": other,
-        "as another": _agent({"name": other, "uid": uids[other], "key": keys[own]}),
-        "a second time": _agent({"name": own, "uid": uids[own], "key": keys[own]}),
-        "as none": _agent({"name": own, "uid": "0", "key": keys[own]}),
+        "as another": _agent({"name": other, "uid": uids[other], **has}),
+        "a second time": _agent({"name": own, "uid": uids[own], **has}),
+        "as none": _agent({"name": own, "uid": "0", **has}),
     }
 
 
