@@ -21,13 +21,20 @@ USUAL = "WARNING"
 """Level at which Fiber sets up no handler."""
 
 
+_loggers: list[Any] = []
+"""The logger, once it was used.  ``getLogger`` takes logging's lock.  A Ctrl-C at the wrong moment
+leaves that lock locked for ever, and then Fiber's threads must go on."""
+
+
 def debug(message: str, *args: object) -> None:
     """Log an event.  Does nothing if ``logging`` is not imported."""
-    # Another thread may be importing the module at this moment.
-    get_logger: Any = getattr(sys.modules.get("logging"), "getLogger", None)
-    if get_logger is None:
-        return
-    logger = get_logger("fiber")
+    if not _loggers:
+        # Another thread may be importing the module at this moment.
+        get_logger: Any = getattr(sys.modules.get("logging"), "getLogger", None)
+        if get_logger is None:
+            return
+        _loggers.append(get_logger("fiber"))
+    logger = _loggers[0]
     if _mp._logger is not None:
         logger.parent = _mp._logger  # from now on its level and handlers count
     try:

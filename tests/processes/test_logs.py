@@ -146,3 +146,20 @@ def test_a_program_without_logging_imports_none() -> None:
     statement = "import sys, fiber._logs as logs; logs.debug('x'); logs.show('WARNING')"
     command = [sys.executable, "-c", f"{statement}; print('logging' in sys.modules)"]
     assert subprocess.run(command, capture_output=True, text=True).stdout == "False\n"
+
+
+def test_a_lock_that_an_interrupt_left_locked_stops_no_thread_of_fiber() -> None:
+    """A Ctrl-C between two lines of ``logging.getLogger`` does that."""
+    program = (
+        "import logging, threading\n"
+        "from fiber import _logs\n"
+        "_logs.debug('first')\n"
+        "logging._lock.acquire()\n"
+        "thread = threading.Thread(target=_logs.debug, args=('next',), daemon=True)\n"
+        "thread.start()\n"
+        "thread.join(20)\n"
+        "print(thread.is_alive(), flush=True)\n"
+        "import os; os._exit(0)\n"
+    )
+    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert ran.stdout == "False\n", ran.stderr
