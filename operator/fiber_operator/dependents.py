@@ -374,7 +374,7 @@ def _has_ports(spec: Mapping[str, Any], ports: list[Body]) -> bool:
 
 def _wrong_secret(name: str, why: str, other: str) -> _Obstructed:
     message = (
-        f"spec.credentialsSecretName is {name}, {why}. Whoever reads it could pose as a program of "
+        f"spec.credentialsSecretName is {name}, {why}. Its reader could pose as a program of "
         f"{other}. Leave credentialsSecretName out, so that the operator makes a Secret, or name "
         "one that belongs to no other pool. The field cannot be changed, so make the pool anew."
     )

@@ -14,6 +14,7 @@ from types import ModuleType
 import pytest
 
 from fiber import _logs
+from patience import PATIENCE
 
 PROGRAM = """
 import logging
@@ -157,9 +158,10 @@ def test_a_lock_that_an_interrupt_left_locked_stops_no_thread_of_fiber() -> None
         "logging._lock.acquire()\n"
         "thread = threading.Thread(target=_logs.debug, args=('next',), daemon=True)\n"
         "thread.start()\n"
-        "thread.join(20)\n"
+        "thread.join()\n"
         "print(thread.is_alive(), flush=True)\n"
         "import os; os._exit(0)\n"
     )
-    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    command = [sys.executable, "-c", program]
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
     assert ran.stdout == "False\n", ran.stderr

@@ -36,7 +36,6 @@ from fiber._backends.kubernetes.template import (
 from fiber._transport.acceptor import Acceptor
 from fiber._transport.authentication import Identity
 from fiber._transport.credentials import (
-    Certificate,
     MasterCredentials,
     WarmCredentials,
     make_certificate,
@@ -197,7 +196,7 @@ class PoolProvisioner:
             keepalive=Keepalive(config.heartbeat_interval, config.suspect_after, config.lost_after),
             lost_grace=PoolMaster.lost_grace,
         )
-        return self._master(host, listener, credentials.certificate), listener
+        return self._master(host, listener), listener
 
     def _acceptor_at(self, host: str) -> Acceptor:
         with self._lock:
@@ -216,11 +215,11 @@ class PoolProvisioner:
         found = reachable_address(self._api, listen, pool=pool, namespace=self.namespace)
         return listen or found, advertised or found
 
-    def _master(self, host: str, listener: MasterListener, certificate: Certificate) -> PoolMaster:
+    def _master(self, host: str, listener: MasterListener) -> PoolMaster:
         port = int(listener.address.rpartition(":")[2])
         # The suffix tells this program from an earlier one with the same pid.
         identity = f"{socket.gethostname()}:{os.getpid()}:{self._suffix}"
-        return PoolMaster(host, port, identity, certificate.hash.hex())
+        return PoolMaster(host, port, identity, self._certificate.hash.hex())
 
     def _find_own_pod(self, cancel: threading.Event) -> Body | None:
         """Return the pod that this program runs in; None outside of pods."""
