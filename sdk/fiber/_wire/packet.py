@@ -183,7 +183,9 @@ def dumps(obj: Any, dump: Callable[..., bytes] = pickle.dumps) -> tuple[bytes, l
         buffers.append(raw)
         return False
 
-    return dump(_light(obj, {}), protocol=5, buffer_callback=keep_in_band), buffers
+    if _has_large_bytes(obj):
+        obj = _light(obj, {})
+    return dump(obj, protocol=5, buffer_callback=keep_in_band), buffers
 
 
 def kept(buffers: Sequence[memoryview]) -> list[memoryview]:
@@ -208,6 +210,20 @@ def large_bytes(buffer: BytesLike) -> bytes:
     if isinstance(buffer, bytes):  # they are part of the pickle
         return buffer
     return copy_bytes(memoryview(buffer))
+
+
+def _has_large_bytes(obj: Any, depth: int = 2) -> bool:
+    """Return False if ``_light`` would replace nothing, which is so for nearly all messages."""
+    kind = type(obj)
+    if kind is tuple and len(obj) <= MAX_BUFFERS:
+        for each in obj:
+            kind = type(each)
+            if kind is bytes and len(each) >= OUT_OF_BAND_MIN:
+                return True
+            if kind is tuple and depth > 1 and _has_large_bytes(each, depth - 1):
+                return True
+        return False
+    return kind is bytes and len(obj) >= OUT_OF_BAND_MIN
 
 
 def _light(obj: Any, known: dict[int, _Large], depth: int = 2) -> Any:
