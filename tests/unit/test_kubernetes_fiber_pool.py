@@ -8,6 +8,7 @@ import queue
 import signal
 import threading
 from collections.abc import Iterator
+from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from fakes.kubernetes_api import Call, Fault
 from fakes.rights import FiberUser
 from fakes.store import Failure
 from fiber._backends.kubernetes import fiber_pool, informer
+from fiber._backends.kubernetes.fiber_pool import FiberPoolClient
 from fiber_api import identity, names
 from fiber_api.rest import Forbidden
 from patience import PATIENCE
@@ -228,8 +230,9 @@ def test_the_name_of_another_programs_pool_is_refused(rig: Rig, told: Told) -> N
 
 
 def test_only_the_newest_demand_is_written(rig: Rig, told: Told) -> None:
-    client = rig.own(told)
-    on(rig, "create", "leases", lambda: [client.demand(number) for number in (1, 2, 3)])
+    own: Future[FiberPoolClient] = Future()  # The client may create its lease at once.
+    on(rig, "create", "leases", lambda: [own.result(PATIENCE).demand(n) for n in (1, 2, 3)])
+    own.set_result(rig.own(told))
     replicas_become(rig, told, 3)
     assert rig.server.api.count("patch", names.PLURAL) == 1
 
