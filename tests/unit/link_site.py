@@ -52,6 +52,9 @@ class Notes:
         with self.changed:
             assert self.changed.wait_for(condition, PATIENCE), vars(self)
 
+    def wait_for_frames(self, count: int) -> None:
+        self.wait(lambda: len(self.frames) >= count)
+
     def on_frame(self, frame: Frame) -> None:
         self.add(self.frames, frame)
 

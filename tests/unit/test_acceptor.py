@@ -72,7 +72,7 @@ class Visitor:
 def pass_time(listener: MasterListener, seconds: float) -> None:
     """Let the acceptor's clock go forward by ``seconds``."""
     loop = listener._acceptor.loop
-    loop.now = lambda: Loop.now() + seconds
+    loop.now = lambda: Loop.now() + seconds  # type: ignore[method-assign]  # of this loop alone
     loop.call_soon(lambda: None)  # the loop looks at its clock when it wakes up
 
 
@@ -280,10 +280,14 @@ def test_an_unwanted_agent_gets_the_reason_and_is_reported_once(site: Site) -> N
     listener, master = site.listener()
     listener._on_agent = lambda link: f"{link.peer.name} is not wanted"
     identity = Identity.of_this_process("agent-1", "uid")
-    for _ in range(2):
+
+    def come() -> None:
         _, agent = site.dialer(listener.address, identity=identity)
-        agent.wait(lambda agent=agent: agent.events == ["lost: agent-1 is not wanted"])
+        agent.wait(lambda: agent.events == ["lost: agent-1 is not wanted"])
         wait_for(lambda: site.on_loop(lambda: not listener._links))
+
+    come()
+    come()
     master.wait(lambda: master.refusals)
     (told,) = master.refusals
     assert told.startswith("agent-1 is not wanted (127.0.0.1:")

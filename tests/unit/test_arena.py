@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import mmap
 import os
 import subprocess
 import sys
@@ -64,7 +65,7 @@ def test_a_block_read_in_place_returns_to_its_sender_after_its_last_view(blocks:
         del part
         os._exit(0)
     os.waitpid(child, 0)
-    assert part == b"content"
+    assert bytes(part) == b"content"
     other = blocks.claim(1000)
     assert other is not block, "its reader still looks at it"
     blocks.settle(other, sent=True)
@@ -201,7 +202,7 @@ def test_a_block_without_memory_leaves_no_descriptor(monkeypatch: pytest.MonkeyP
 
     before = os.listdir("/proc/self/fd")
     with monkeypatch.context() as short:
-        short.setattr(memory_files.mmap, "mmap", refuse)
+        short.setattr(mmap, "mmap", refuse)
         with pytest.raises(OSError, match="no memory"):
             MessageBlock(1 << 16)
     assert os.listdir("/proc/self/fd") == before
@@ -217,7 +218,7 @@ def test_much_memory_is_given_back_by_a_thread(monkeypatch: pytest.MonkeyPatch) 
         del part
         os._exit(0 if threading.active_count() == 1 else 1)
     assert os.waitpid(child, 0)[1] == 0, "it belongs to the process that made it"
-    assert part == b"0123456789"
+    assert bytes(part) == b"0123456789"
     del part
     assert wait_until(lambda: owner.closed, PATIENCE)
 

@@ -10,11 +10,11 @@ from collections.abc import Iterator
 import pytest
 
 from fiber._wire import memory_files, packet
-from fiber._wire.memory_files import IN_FILE, Assembly, pass_on
+from fiber._wire.memory_files import IN_FILE, RETAINED_LIMIT, Assembly, pass_on
 from fiber._wire.messages import Deliver, FromChild, TunnelData, decode, is_passed_on
 from fiber._wire.packet import INLINE_LIMIT
 
-SIZES = (INLINE_LIMIT + 1, IN_FILE, packet.RETAINED_LIMIT + 1)
+SIZES = (INLINE_LIMIT + 1, IN_FILE, RETAINED_LIMIT + 1)
 
 Pair = tuple[socket.socket, socket.socket]
 
@@ -60,7 +60,7 @@ def test_a_packet_brings_parts_of_a_frame(pair: Pair, size: int) -> None:
 
 def test_a_packet_refers_to_memory_that_was_passed_on_and_copies_any_other(pair: Pair) -> None:
     one, other = pair
-    message = arrived(bytes(packet.RETAINED_LIMIT))
+    message = arrived(bytes(RETAINED_LIMIT))
     (buffer,) = views(message)
     packet.send(one, b"", [buffer])
     pass_on(buffer)
@@ -78,7 +78,7 @@ def test_parts_of_two_frames_are_copied(pair: Pair) -> None:
         pass_on(buffer)
     packet.send(one, b"payload", buffers)
     message = packet.receive(other)
-    assert message.payload == b"payload"
+    assert bytes(message.payload) == b"payload"
     assert message.buffers == buffers
     message.release()
 
@@ -104,7 +104,7 @@ def test_a_frame_that_is_not_passed_on_takes_no_descriptor() -> None:
     whole = Assembly(len(frame), passed_on=False)
     whole.add(memoryview(frame))
     assert os.listdir("/proc/self/fd") == before
-    assert whole.frame() == frame
+    assert bytes(whole.frame()) == frame
 
 
 def test_the_master_keeps_its_childrens_messages_and_forwards_the_rest() -> None:

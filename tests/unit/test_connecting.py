@@ -74,4 +74,4 @@ def test_a_master_at_the_unspecified_ipv6_address_takes_both_families(site: Site
     for host in ("127.0.0.1", "[::1]"):
         _, agent = site.dialer(f"{host}:{port_of(listener.address)}")
         agent.link.send(host.encode())
-    master.wait(lambda: sorted(master.frames) == [b"127.0.0.1", b"[::1]"])
+    master.wait(lambda: sorted(map(bytes, master.frames)) == [b"127.0.0.1", b"[::1]"])

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from fiber._transport.authentication import Identity
-from fiber._transport.credentials import MasterCredentials
+from fiber._transport.credentials import OwnCredentials
 from fiber._transport.link import Keepalive
 from fiber._transport.listener import MasterListener
 from patience import PATIENCE
@@ -28,7 +28,7 @@ def test_frames_of_all_sizes_cross_both_ways(site: Site) -> None:
         master.link.send(frame)
         agent.link.send(frame)
     for notes in (master, agent):
-        notes.wait(lambda notes=notes: len(notes.frames) == len(frames))
+        notes.wait_for_frames(len(frames))
         assert notes.frames == frames
 
 
@@ -39,7 +39,7 @@ def test_a_flood_of_small_frames_causes_no_overflow(site: Site) -> None:
         master.link.send(b"%d" % number)
         agent.link.send(b"%d" % number)
     for notes in (master, agent):
-        notes.wait(lambda notes=notes: len(notes.frames) == count)
+        notes.wait_for_frames(count)
         assert notes.frames == [b"%d" % number for number in range(count)]
         assert notes.link.statistics().missed == 0
 
@@ -58,7 +58,7 @@ def test_any_thread_may_send(site: Site) -> None:
         thread.join()
     master.wait(lambda: len(master.frames) == 4 * 300)
     for name in range(4):
-        own = [frame for frame in master.frames if frame.startswith(b"%d " % name)]
+        own = [frame for frame in map(bytes, master.frames) if frame.startswith(b"%d " % name)]
         assert own == [b"%d %d" % (name, number) for number in range(300)]
 
 
@@ -80,7 +80,7 @@ def test_many_agents_share_one_socket(site: Site) -> None:
     for link in master.links:
         link.send(link.peer.name.encode())
     for number, agent in enumerate(agents):
-        agent.wait(lambda agent=agent: agent.frames)
+        agent.wait_for_frames(1)
         assert agent.frames == [b"agent-%d" % number]
 
 
@@ -99,10 +99,10 @@ def test_a_broken_connection_neither_loses_nor_repeats_a_frame(
         master.link.send(frame)
         agent.link.send(frame)
         if number % (len(sent) // times) == 50:
-            master.wait(lambda number=number: len(master.frames) > number // 2)
+            master.wait_for_frames(number // 2 + 1)
             site.on_loop(lambda: break_off(listener))
     for notes in (master, agent):
-        notes.wait(lambda notes=notes: len(notes.frames) == len(sent))
+        notes.wait_for_frames(len(sent))
         assert notes.frames == sent
         assert not any("lost" in event for event in notes.events)
     assert agent.link.statistics().breaks > 0
@@ -211,7 +211,7 @@ loop.run()
 
 @contextlib.contextmanager
 def remote_agent(
-    listener: MasterListener, credentials: MasterCredentials
+    listener: MasterListener, credentials: OwnCredentials
 ) -> Iterator[subprocess.Popen[bytes]]:
     """An agent in a process of its own that sends back what it gets."""
     path = os.pathsep.join(entry for entry in sys.path if entry)

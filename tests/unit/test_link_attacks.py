@@ -98,7 +98,7 @@ def talk(site: Site, path: Path, listener: MasterListener, master: Notes) -> Not
             for frame in FRAMES[number : number + 3]:
                 notes.link.send(frame)
         for notes in sides:
-            notes.wait(lambda notes=notes, number=number: len(notes.frames) >= number + 3)
+            notes.wait_for_frames(number + 3)
     return agent
 
 
@@ -243,7 +243,7 @@ def test_the_path_with_a_stolen_agents_key_is_no_master(site: Site) -> None:
     assert isinstance(agent.errors[0], AuthenticationError)
 
 
-def test_a_proof_is_good_for_one_master_alone(site: Site) -> None:
+def test_a_proof_is_good_for_one_master_alone(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     """Relay with another certificate in the middle: an agent's proof cannot be passed on."""
     listener, master = site.listener()
     middle = authentication.agent_context()
@@ -251,7 +251,8 @@ def test_a_proof_is_good_for_one_master_alone(site: Site) -> None:
     hello = AgentHello(Identity.of_this_process("agent-1", "uid"), "0" * 32, 0, False).encode()
     sock = socket.create_connection(("127.0.0.1", port_of(listener.address)), PATIENCE)
     handshake = authentication.AgentHandshake(sock, middle)
-    handshake.sock.getpeercert = lambda binary_form=False: b"what the one in the middle shows"
+    shown = b"what the one in the middle shows"
+    monkeypatch.setattr(handshake.sock, "getpeercert", lambda binary_form=False: shown)
     try:
         with pytest.raises(authentication.Untrusted, match="does not believe"):
             complete(handshake, handshake.ask(credentials, hello))

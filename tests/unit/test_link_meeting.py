@@ -239,9 +239,9 @@ def test_an_agent_that_comes_before_its_pod_is_known_waits_for_it(site: Site) ->
     listener._knows = lambda identity: "" if identity.name in known else None
     _, agent = site.dialer(listener.address)
     master.wait(lambda: master.proofs)
-    assert agent.links == agent.errors == []
+    assert (agent.links, agent.errors) == ([], [])
     site.on_loop(listener.look_again)
-    assert agent.links == agent.errors == []
+    assert (agent.links, agent.errors) == ([], [])
     known.append("agent-1")
     site.on_loop(listener.look_again)
     assert agent.link is not master.link

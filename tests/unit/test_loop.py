@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import pytest
@@ -75,7 +76,12 @@ def test_calls_from_many_threads_all_arrive_each_thread_in_order(loop: Loop) -> 
 def test_timers_fire_in_order_of_their_time(loop: Loop) -> None:
     fired: list[str] = []
     last = threading.Event()
-    loop.call_later(0.03, lambda: (fired.append("third"), last.set()))
+
+    def third() -> None:
+        fired.append("third")
+        last.set()
+
+    loop.call_later(0.03, third)
     loop.call_later(0.02, fired.append, "second")
     loop.call_later(0.0, fired.append, "first")
     assert last.wait(PATIENCE)
@@ -107,7 +113,11 @@ def test_calls_that_ask_for_more_calls_do_not_keep_descriptors_waiting(
         if not heard.is_set():
             loop.call_soon(again)
 
-    loop.register(pipe[0], lambda: (os.read(pipe[0], 1), heard.set()))
+    def hear() -> None:
+        os.read(pipe[0], 1)
+        heard.set()
+
+    loop.register(pipe[0], hear)
     loop.call_soon(again)
     os.write(pipe[1], b"x")
     assert heard.wait(PATIENCE)
@@ -141,8 +151,12 @@ def test_earlier_requests_run_before_later_events(loop: Loop, pipe: tuple[int, i
         seen.append(os.read(reading, 100).decode())
         heard.set()
 
+    def be_busy() -> None:
+        busy.set()
+        go_on.wait(PATIENCE)
+
     loop.register(reading, hear)
-    loop.call_soon(lambda: (busy.set(), go_on.wait(PATIENCE)))
+    loop.call_soon(be_busy)
     assert busy.wait(PATIENCE)
     loop.call_soon(seen.append, "expected")
     os.write(writing, b"happened")
@@ -169,7 +183,7 @@ def test_many_ready_descriptors_are_served_in_groups_and_in_turn(
 
     def all_ready() -> None:
         for fd in readable:
-            loop.register(fd, lambda fd=fd: call(fd))
+            loop.register(fd, partial(call, fd))
 
     loop.call_soon(all_ready)  # on its thread, so that one poll could see them all
     assert all_called.wait(PATIENCE)
@@ -211,7 +225,7 @@ def test_a_descriptor_that_a_callback_forgot_is_not_called_in_the_same_round(loo
 
     def both_ready() -> None:
         for reader in readers:
-            loop.register(reader, lambda me=reader: first_come(me))
+            loop.register(reader, partial(first_come, reader))
         for _, writer in ends:
             os.write(writer, b"x")
 

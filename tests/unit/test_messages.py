@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pickle
-import struct
+from array import array
 
 import pytest
 from hypothesis import given
@@ -167,7 +167,7 @@ def test_a_packet_is_not_copied_and_writable_where_the_frame_is() -> None:
 
 
 def test_buffers_of_any_item_size_are_taken_by_their_bytes() -> None:
-    floats = memoryview(struct.pack("<2d", 1.5, 2.5)).cast("d")
+    floats = memoryview(array("d", (1.5, 2.5)))
     message = decode(FromChild(1, b"", [floats]).encode())
     assert isinstance(message, FromChild)
     assert bytes(message.buffers[0]) == floats.tobytes()

@@ -35,7 +35,8 @@ def test_a_sealed_message_shows_its_size_alone(size: int) -> None:
 def test_messages_open_in_order_whenever_the_key_changes(
     messages: list[bytes], per_key: int, bytes_per_key: int
 ) -> None:
-    sealer, opener = (kind(SECRET, per_key, bytes_per_key) for kind in (Sealer, Opener))
+    sealer = Sealer(SECRET, per_key, bytes_per_key)
+    opener = Opener(SECRET, per_key, bytes_per_key)
     for message in messages:
         assert opener.open(sealed(sealer, message)) == message
 

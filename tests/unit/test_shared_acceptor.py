@@ -32,7 +32,7 @@ def test_each_agent_comes_to_the_pool_whose_key_it_has(
         credentials = pool.agent(identity.name, identity.uid)
         _, agent = site.dialer(acceptor.address, credentials=credentials, identity=identity)
         agent.link.send(b"%d" % number)
-        master.wait(lambda master=master: master.frames)
+        master.wait_for_frames(1)
     assert [master.frames for master in masters] == [[b"0"], [b"1"]]
     assert [len(master.links) for master in masters] == [1, 1]
 
@@ -64,7 +64,7 @@ def test_the_end_of_one_pool_leaves_the_others_and_tells_its_late_agents(
     late.wait(lambda: late.errors)
     assert isinstance(late.errors[0], LinkError)
     assert "this master no longer uses the pool of this agent" in str(late.errors[0])
-    assert first_master.links == first_master.refusals == []
+    assert (first_master.links, first_master.refusals) == ([], [])
     before.link.send(b"still here")
     second_master.wait(lambda: second_master.frames == [b"still here"])
     after = _dial(site, acceptor, pools[1], "after")

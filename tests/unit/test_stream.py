@@ -20,11 +20,11 @@ from fiber._transport.link_protocol import (
     SIZE,
     WINDOW,
     WINDOW_BYTES,
-    Datagram,
     Gap,
     LinkProtocol,
 )
 from fiber._wire.messages import ProtocolError
+from unit.datagrams import joined, outgoing
 
 BUDGET_SMALL = 64
 
@@ -68,7 +68,7 @@ class Network:
         self.ends[side].send(frame)
 
     def speak(self, side: int) -> None:
-        for datagram in self.ends[side].outgoing(self.now):
+        for datagram in outgoing(self.ends[side], self.now):
             if self.rng.random() < self.drop:
                 continue
             self.flying[side].append(datagram)
@@ -172,10 +172,6 @@ def test_a_break_at_any_step_loses_no_frame(sizes: list[int], cuts: set[int], se
     network.check()
 
 
-def joined(datagram: Datagram) -> bytes:
-    return datagram if isinstance(datagram, bytes) else b"".join(datagram)
-
-
 def pair(now: float = 0.0, *, budget: int = BUDGET) -> tuple[LinkProtocol, LinkProtocol]:
     one, other = (LinkProtocol(now, budget=budget) for _ in range(2))
     one.connected(0)
@@ -186,9 +182,9 @@ def pair(now: float = 0.0, *, budget: int = BUDGET) -> tuple[LinkProtocol, LinkP
 
 def meet(one: LinkProtocol, other: LinkProtocol, now: float) -> None:
     """Exchange what both have to say."""
-    for datagram in one.outgoing(now):
+    for datagram in outgoing(one, now):
         other.received(datagram, now)
-    for datagram in other.outgoing(now):
+    for datagram in outgoing(other, now):
         one.received(datagram, now)
 
 
@@ -197,7 +193,7 @@ def test_a_new_connection_sends_a_datagram_without_a_message() -> None:
     one.connected(0)
     other.connected(0)
     assert not other.has_received
-    (datagram,) = one.outgoing(0)
+    (datagram,) = outgoing(one, 0)
     assert other.received(datagram, 0) == []
     assert other.has_received
 
@@ -207,7 +203,7 @@ def test_frames_that_wait_travel_in_one_datagram() -> None:
     frames = [b"%d" % number for number in range(1000)]
     for frame in frames:
         one.send(frame)
-    (datagram,) = one.outgoing(0)
+    (datagram,) = outgoing(one, 0)
     assert other.received(datagram, 0) == frames
 
 
@@ -217,7 +213,7 @@ def test_a_frame_in_pieces_arrives_as_one_however_it_is_cut() -> None:
         pieces = [random.Random(size).randbytes(size) for size in sizes]
         one.send(*pieces)
         one.send(b"after it")
-        frames = [f for datagram in one.outgoing(0) for f in other.received(joined(datagram), 0)]
+        frames = [f for datagram in outgoing(one, 0) for f in other.received(datagram, 0)]
         assert frames == [b"".join(pieces), b"after it"]
         assert one.statistics().queued_bytes == 0
 
@@ -237,17 +233,17 @@ def test_the_window_bounds_the_unconfirmed_bytes() -> None:
     one, other = pair()
     frame = bytes(2 * WINDOW_BYTES - BUDGET)
     one.send(frame)
-    first = [joined(datagram) for datagram in one.outgoing(0)]
+    first = outgoing(one, 0)
     assert WINDOW_BYTES <= one.statistics().unacknowledged_bytes <= WINDOW_BYTES + BUDGET
-    assert one.outgoing(0) == []
+    assert outgoing(one, 0) == []
     acknowledgements = 0
     for datagram in first:
         assert other.received(datagram, 0) == []
-        for acknowledgement in other.outgoing(0):
+        for acknowledgement in outgoing(other, 0):
             one.received(acknowledgement, 0)
             acknowledgements += 1
     assert acknowledgements == 4, "one for each quarter of the window"
-    second = [joined(datagram) for datagram in one.outgoing(0)]
+    second = outgoing(one, 0)
     assert [f for datagram in second for f in other.received(datagram, 0)] == [frame]
 
 
@@ -256,13 +252,13 @@ def test_the_window_bounds_the_unconfirmed_frames() -> None:
     datagrams = []
     for number in range(2 * WINDOW):
         one.send(b"%d" % number)
-        datagrams += one.outgoing(0)
+        datagrams += outgoing(one, 0)
     assert len(datagrams) == WINDOW == one.statistics().unacknowledged_datagrams
     for datagram in datagrams[: WINDOW // 4]:
         other.received(datagram, 0)
-    (acknowledgement,) = other.outgoing(0)
+    (acknowledgement,) = outgoing(other, 0)
     one.received(acknowledgement, 0)
-    (rest,) = one.outgoing(0)
+    (rest,) = outgoing(one, 0)
     assert one.statistics().queued_frames == 0
     for datagram in datagrams[WINDOW // 4 :]:
         other.received(datagram, 0)
@@ -274,24 +270,24 @@ def test_request_and_reply_need_no_separate_acknowledgement() -> None:
     now = 0.0
     for number in range(10):
         one.send(b"request %d" % number)
-        (request,) = one.outgoing(now)
+        (request,) = outgoing(one, now)
         assert other.received(request, now) == [b"request %d" % number]
-        assert other.outgoing(now) == []
+        assert outgoing(other, now) == []
         now += ACK_DELAY / 2
         other.send(b"reply")
-        (reply,) = other.outgoing(now)
+        (reply,) = outgoing(other, now)
         assert one.received(reply, now) == [b"reply"]
-    assert one.outgoing(now) == []
+    assert outgoing(one, now) == []
     assert one.statistics().datagrams_sent == 11
 
 
 def test_an_acknowledgement_waits_only_so_long() -> None:
     one, other = pair()
     one.send(b"note")
-    other.received(one.outgoing(0)[0], 0)
-    assert other.outgoing(0) == []
+    other.received(outgoing(one, 0)[0], 0)
+    assert outgoing(other, 0) == []
     assert other.next_timer() == ACK_DELAY
-    (acknowledgement,) = other.outgoing(ACK_DELAY)
+    (acknowledgement,) = outgoing(other, ACK_DELAY)
     one.received(acknowledgement, ACK_DELAY)
     assert one.idle
 
@@ -299,9 +295,9 @@ def test_an_acknowledgement_waits_only_so_long() -> None:
 def test_the_datagram_after_a_lost_one_raises_gap() -> None:
     one, other = pair()
     one.send(b"lost")
-    one.outgoing(0)
+    outgoing(one, 0)
     one.send(b"next")
-    (after,) = one.outgoing(0)
+    (after,) = outgoing(one, 0)
     with pytest.raises(Gap, match="datagram 2 came where 1 was expected"):
         other.received(after, 0)
     assert other.statistics().missed == 1
@@ -310,8 +306,8 @@ def test_the_datagram_after_a_lost_one_raises_gap() -> None:
 def test_a_last_loss_is_noticed_by_the_heartbeat() -> None:
     one, other = pair()
     one.send(b"lost")
-    one.outgoing(0)
-    (beat,) = one.outgoing(HEARTBEAT)
+    outgoing(one, 0)
+    (beat,) = outgoing(one, HEARTBEAT)
     with pytest.raises(Gap):
         other.received(beat, HEARTBEAT)
 
@@ -319,24 +315,24 @@ def test_a_last_loss_is_noticed_by_the_heartbeat() -> None:
 def test_a_repetition_is_dropped_and_acknowledged_at_once() -> None:
     one, other = pair()
     one.send(b"twice")
-    (datagram,) = one.outgoing(0)
+    (datagram,) = outgoing(one, 0)
     assert other.received(datagram, 0) == [b"twice"]
     assert other.received(datagram, 0) == []
-    assert len(other.outgoing(0)) == 1
+    assert len(outgoing(other, 0)) == 1
     assert other.statistics().repeated == 1
 
 
 def test_frames_wait_while_disconnected_and_leave_afterwards() -> None:
     one, other = pair()
     one.send(b"under way")
-    one.outgoing(0)
+    outgoing(one, 0)
     one.disconnected()
     other.disconnected()
     one.send(b"queued")
-    assert one.outgoing(50) == []
+    assert outgoing(one, 50) == []
     one.connected(other.arrived)
     other.connected(one.arrived)
-    frames = [frame for datagram in one.outgoing(50) for frame in other.received(datagram, 50)]
+    frames = [frame for datagram in outgoing(one, 50) for frame in other.received(datagram, 50)]
     assert frames == [b"under way", b"queued"]
     assert one.statistics().breaks == one.statistics().resent == 1
 
@@ -346,8 +342,8 @@ def test_a_peer_that_lost_its_place_cannot_resume(arrived: int) -> None:
     one, other = pair()
     for frame in (b"1", b"2"):
         one.send(frame)
-        other.received(one.outgoing(0)[0], 0)
-    one.received(other.outgoing(ACK_DELAY)[0], 0)
+        other.received(outgoing(one, 0)[0], 0)
+    one.received(outgoing(other, ACK_DELAY)[0], 0)
     one.disconnected()
     with pytest.raises(ProtocolError, match=f"cannot resume after datagram {arrived}"):
         one.connected(arrived)
@@ -355,11 +351,11 @@ def test_a_peer_that_lost_its_place_cannot_resume(arrived: int) -> None:
 
 def test_an_idle_stream_says_that_it_is_alive() -> None:
     one, other = pair()
-    assert one.outgoing(HEARTBEAT - 0.1) == []
-    (beat,) = one.outgoing(HEARTBEAT)
+    assert outgoing(one, HEARTBEAT - 0.1) == []
+    (beat,) = outgoing(one, HEARTBEAT)
     assert other.received(beat, HEARTBEAT) == []
     assert other.tick(HEARTBEAT) == 0
-    assert other.outgoing(HEARTBEAT - 0.1) == [], "a heartbeat needs no answer"
+    assert outgoing(other, HEARTBEAT - 0.1) == [], "a heartbeat needs no answer"
 
 
 def test_silence_counts_only_while_this_process_runs() -> None:
@@ -374,7 +370,7 @@ def test_statistics_count_bytes_and_frames() -> None:
     one, other = pair()
     one.send(b"abc")
     assert one.statistics().queued_frames == 1
-    (datagram,) = one.outgoing(0)
+    (datagram,) = outgoing(one, 0)
     other.received(datagram, 0)
     counts = other.statistics()
     assert (counts.frames_received, counts.bytes_received) == (1, 24 + len(datagram))
@@ -393,7 +389,7 @@ def numbered(frames: int) -> bytes:
     one, _ = pair()
     for _ in range(frames):
         one.send(b"frame")
-    return one.outgoing(0)[0]
+    return outgoing(one, 0)[0]
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from fiber._transport.link_protocol import SLOTS, Lane, LinkProtocol, SendQueue
+from fiber._transport.link_protocol import SLOTS, LinkProtocol, SendQueue
 from fiber._wire import memory_files
+from unit.datagrams import outgoing
 
 BUDGET = 64
 LARGE = 10 * BUDGET
@@ -25,10 +26,9 @@ def ends() -> tuple[LinkProtocol, LinkProtocol]:
 def arriving(sender: LinkProtocol, receiver: LinkProtocol) -> Iterator[bytes]:
     """The frames, in the order in which they are complete."""
     while not sender.idle:
-        for datagram in sender.outgoing(0):
-            whole = datagram if isinstance(datagram, bytes) else b"".join(datagram)
-            yield from map(bytes, receiver.received(whole, 0))
-        for answer in receiver.outgoing(1):
+        for datagram in outgoing(sender, 0):
+            yield from map(bytes, receiver.received(datagram, 0))
+        for answer in outgoing(receiver, 1):
             sender.received(answer, 1)
 
 
@@ -131,11 +131,11 @@ def test_a_link_holds_at_most_a_window_and_the_partial_message() -> None:
         pass
     sender.send(bytes(LARGE), lane="one")
     while not sender.idle:
-        for datagram in sender.outgoing(0):
+        for datagram in outgoing(sender, 0):
             most = max(most, sender.statistics().unacknowledged_bytes)
-            receiver.received(datagram if isinstance(datagram, bytes) else b"".join(datagram), 0)
+            receiver.received(datagram, 0)
             assert receiver.statistics().partial_bytes <= LARGE
-        for answer in receiver.outgoing(1):
+        for answer in outgoing(receiver, 1):
             sender.received(answer, 1)
     assert most <= 6 * BUDGET
     assert receiver.statistics().partial_bytes == 0
@@ -146,7 +146,7 @@ def test_a_stream_that_ends_drops_partial_frames(
 ) -> None:
     sender, receiver = ends
     sender.send(bytes(LARGE), lane="one")
-    receiver.received(sender.outgoing(0)[0], 0)
+    receiver.received(outgoing(sender, 0)[0], 0)
     assert receiver.statistics().partial_bytes
     for end in ends:
         end.end()
@@ -163,13 +163,11 @@ def test_whatever_is_sent_arrives_in_the_order_that_is_promised(
     sender, receiver = (LinkProtocol(0, budget=BUDGET) for _ in range(2))
     sender.connected(0)
     receiver.connected(0)
-    sent: list[tuple[Lane, bytes]] = []
+    sent: list[tuple[int | None, bytes]] = []
     arrived: list[bytes] = []
 
     def carry() -> None:
-        datagrams = [
-            each if isinstance(each, bytes) else b"".join(each) for each in sender.outgoing(0)
-        ]
+        datagrams = outgoing(sender, 0)
         lost = rng.random() < 0.2
         for datagram in datagrams[: rng.randrange(len(datagrams) + 1) if lost else None]:
             arrived.extend(map(bytes, receiver.received(datagram, 0)))
@@ -177,7 +175,7 @@ def test_whatever_is_sent_arrives_in_the_order_that_is_promised(
             for end, other in ((sender, receiver), (receiver, sender)):
                 end.disconnected()
                 end.connected(other.arrived)
-        for answer in receiver.outgoing(1):
+        for answer in outgoing(receiver, 1):
             sender.received(answer, 1)
 
     for number in range(100):

@@ -100,7 +100,7 @@ def test_agents_wait_until_the_operator_has_signed(site: Site, key: WarmKey) -> 
     agent = dial(site, listener.address, key.agent("warm-1", "77"))
     master.wait(lambda: master.proofs)
     site.on_loop(listener.look_again)
-    assert agent.links == agent.errors == []
+    assert (agent.links, agent.errors) == ([], [])
     assert key.sign(credentials, 1)
     site.on_loop(listener.look_again)
     assert agent.link is not master.link
