@@ -18,6 +18,7 @@ from fiber._runtime.work_items import WorkItem
 from fiber._runtime.workers import WorkerHandle
 from fiber._transport.loop import LoopTimer
 from fiber._wire import work
+from fiber._wire.memory_files import BytesLike
 from fiber._wire.packet import Message
 from fiber.process import PoolProcess, Process
 from processes import pool_tasks as tasks
@@ -121,9 +122,10 @@ class FakeChild:
     def __init__(self, name: str) -> None:
         self.name = name
         self.host = "here"
-        self.pid = 1
+        self.pid: int | None = 1
         self.start_error: Exception | None = None
         self.waiting = False
+        self.leaving = ""
         self.node = ""
         self.packets: list[tuple[int, bytes]] = []
         self.recalls = 0
@@ -133,9 +135,9 @@ class FakeChild:
     def start(self) -> None:
         """Do nothing: the test decides what the worker does."""
 
-    def deliver(self, seq: int, payload: bytes, buffers: Sequence[memoryview] = ()) -> bool:
+    def deliver(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
         if not self.gone:
-            self.packets.append((seq, payload))
+            self.packets.append((seq, bytes(payload)))
         return not self.gone
 
     def recall(self) -> None:
@@ -163,9 +165,10 @@ class Results:
         self.done = 0
         self.error: BaseException | None = None
 
-    def add_results(self, start: int, outcomes: list[Any], mixed: bool, size: int = 0) -> None:
+    def add_results(self, start: int, outcomes: list[Any], mixed: bool, size: int = 0) -> bool:
         assert not self.outcomes.keys() & range(start, start + len(outcomes)), "twice"
         self.outcomes.update(enumerate(outcomes, start))
+        return False
 
     def has_room(self) -> bool:
         return True

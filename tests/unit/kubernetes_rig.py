@@ -31,7 +31,7 @@ OTHER = PoolMaster("10.0.0.8", 41338, "laptop-8:4712", CERTIFICATE.hash.hex())
 Body = dict[str, Any]
 
 
-def kubeconfig(folder: Path, url: str, user: Body | None = None, **cluster: str) -> Path:
+def kubeconfig(folder: Path, url: str, user: Body | None = None, /, **cluster: str) -> Path:
     """A file for ``KUBECONFIG`` whose current context is ``here``, with the namespace lab."""
     path = folder / "kubeconfig"
     contexts = {"here": {"namespace": NAMESPACE}, "bare": {}}

@@ -19,8 +19,8 @@ def rig() -> Rig:
     return Rig(1)
 
 
-def called(rig: Rig, queue: CallQueue, number: int) -> CallFuture:
-    future = CallFuture(rig.executor, queue)
+def called(rig: Rig, queue: CallQueue, number: int) -> CallFuture[int]:
+    future: CallFuture[int] = CallFuture(rig.executor, queue)
     rig.executor.call(future, tasks.square, (number,), {}, queue=queue)
     return future
 

@@ -212,9 +212,12 @@ def test_an_answer_looks_at_no_stream_that_it_does_not_concern(
     streams[0].read(range(2))
     looked_at: list[InputStream] = []
     take = InputStream.take
-    monkeypatch.setattr(
-        InputStream, "take", lambda stream: looked_at.append(stream) or take(stream)
-    )
+
+    def look(stream: InputStream) -> Any:
+        looked_at.append(stream)
+        return take(stream)
+
+    monkeypatch.setattr(InputStream, "take", look)
     rig.answer_all()
     assert set(looked_at) <= {streams[0]}
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 
@@ -109,7 +109,7 @@ def test_every_other_pod_runs_its_processes_itself(
 
 @pytest.mark.parametrize("backend", ["local", "loopback"])
 def test_a_chosen_backend_skips_the_detection(
-    backend: str, monkeypatch: pytest.MonkeyPatch
+    backend: Literal["local", "loopback"], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     account = in_a_pod(monkeypatch, ALLOWED)
     assert not _is_on_cluster(Config(backend=backend))

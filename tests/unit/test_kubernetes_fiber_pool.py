@@ -231,7 +231,7 @@ def test_the_name_of_another_programs_pool_is_refused(rig: Rig, told: Told) -> N
 
 def test_only_the_newest_demand_is_written(rig: Rig, told: Told) -> None:
     own: Future[FiberPoolClient] = Future()  # The client may create its lease at once.
-    on(rig, "create", "leases", lambda: [own.result(PATIENCE).demand(n) for n in (1, 2, 3)])
+    on(rig, "create", "leases", lambda: list(map(own.result(PATIENCE).demand, (1, 2, 3))))
     own.set_result(rig.own(told))
     replicas_become(rig, told, 3)
     assert rig.server.api.count("patch", names.PLURAL) == 1

@@ -96,7 +96,7 @@ def test_no_change_is_lost_when_a_watch_ends(case: Case, how: str) -> None:
 
     case.server.do(change_meanwhile)
     case.add("c")
-    told = []
+    told: list[str] = []
     while told[-1:] != ["+c"]:
         told += case.next()
     assert "-a" in told
@@ -150,7 +150,10 @@ def test_an_api_that_ends_every_watch_at_once_is_not_flooded(
 
     def wait(seconds: float) -> bool:
         pauses.put(seconds)
-        return pauses.qsize() >= 4 and case.watch._stopped.set() is None
+        if pauses.qsize() < 4:
+            return False
+        case.watch._stopped.set()
+        return True
 
     monkeypatch.setattr(informer, "_EARLY", float("inf"))
     monkeypatch.setattr(case.watch._stopped, "wait", wait)
@@ -167,7 +170,8 @@ def test_a_retry_after_is_respected(case: Case, monkeypatch: pytest.MonkeyPatch)
 
     def wait(seconds: float) -> bool:
         pauses.put(seconds)
-        return case.watch._stopped.set() is None
+        case.watch._stopped.set()
+        return True
 
     monkeypatch.setattr(case.watch._stopped, "wait", wait)
     case.server.api.faults.append(Fault("list", "pods", status=429, retry_after=20))

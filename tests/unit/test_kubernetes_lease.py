@@ -51,7 +51,8 @@ class Case:
         )
 
     def lease(self) -> Body:
-        return self.rig.get("leases", LEASE)["spec"]
+        spec: Body = self.rig.get("leases", LEASE)["spec"]
+        return spec
 
 
 @pytest.fixture

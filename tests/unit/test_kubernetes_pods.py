@@ -72,7 +72,7 @@ class Listener:
 class Attachment:
     """A pool that must not begin."""
 
-    name, namespace, doing, remedy = "es-1", "lab", "make", "delete"
+    name, namespace, doing, displaced, remedy = "es-1", "lab", "make", "", "delete"
 
     def attach(self, cancel: threading.Event) -> Any:
         raise AssertionError("it was made after the end")
@@ -181,6 +181,16 @@ def until_the_end(cancel: threading.Event) -> PreparedPool:
     raise FiberError("the end")
 
 
+def telling(asked: threading.Event) -> Callable[[threading.Event], PreparedPool]:
+    """Make an ``until_the_end`` that first tells that it was asked."""
+
+    def prepare(cancel: threading.Event) -> PreparedPool:
+        asked.set()
+        return until_the_end(cancel)
+
+    return prepare
+
+
 def test_an_error_that_ends_the_wait_ends_later_waits_too(site: Site) -> None:
     pods = site.pods(until_the_end)
     hopeless = {"reason": "BackoffLimitExceeded", "message": "all die", "terminal": True}
@@ -211,7 +221,7 @@ def test_the_live_line_is_removed_before_a_refusal(
 ) -> None:
     monkeypatch.setattr(waiting, "_is_terminal", lambda: True)
     waits = threading.Event()
-    pods = site.pods(lambda cancel: waits.set() or until_the_end(cancel))
+    pods = site.pods(telling(waits))
     _, owner = site.start()
     assert waits.wait(PATIENCE)
     error = FiberPoolError("it was deleted", pool="es-1", namespace="lab", reason="Deleted")
@@ -223,7 +233,7 @@ def test_the_live_line_is_removed_before_a_refusal(
 
 def test_the_timeout_error_says_that_the_api_server_does_not_answer(site: Site) -> None:
     waits = threading.Event()
-    pods = site.pods(lambda cancel: waits.set() or until_the_end(cancel), Config(pod_timeout=0.1))
+    pods = site.pods(telling(waits), Config(pod_timeout=0.1))
     child, owner = site.start()
     assert owner.gone.wait(PATIENCE)
     assert "within 0.1 s: the API server kube has not answered yet" in str(child.start_error)
@@ -310,21 +320,22 @@ def test_an_agent_that_began_anew_is_let_in_and_its_pod_stays(site: Site) -> Non
         "metadata": {"name": "es-1-a", "uid": "uid", "labels": {}},
         "status": {"phase": "Running"},
     }
-    first, second = Dialled("es-1-a"), Dialled("es-1-a")
+    first: Any = Dialled("es-1-a")
+    second: Any = Dialled("es-1-a")
     done = threading.Event()
     told: list[str | None] = []
 
     def happen() -> None:
         pods.on_pod("es-1-a", pod)
-        told.append(pods.on_agent(first))  # type: ignore[arg-type]
-        told.append(pods.on_agent(second))  # type: ignore[arg-type]
+        told.append(pods.on_agent(first))
+        told.append(pods.on_agent(second))
         done.set()
 
     site.loop.call_soon(happen)
     assert done.wait(PATIENCE)
     assert told == [None, None]
     (agent,) = pods.agents.agents.values()
-    assert agent._link is second  # type: ignore[comparison-overlap]
+    assert agent._link is second
     assert pods._given_up == set()
     pods.close()
 

@@ -53,7 +53,7 @@ def stderr_is(monkeypatch: pytest.MonkeyPatch, stderr: object) -> None:
 def terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     stderr_is(monkeypatch, SimpleNamespace(isatty=lambda: True, fileno=lambda: 2))
     size = os.terminal_size((28, 24))
-    monkeypatch.setattr(waiting.os, "get_terminal_size", lambda descriptor: size)
+    monkeypatch.setattr(os, "get_terminal_size", lambda descriptor: size)
 
 
 @pytest.fixture
@@ -110,7 +110,7 @@ class TestOnATerminal:
         def refuse(descriptor: int) -> os.terminal_size:
             raise OSError("not a terminal after all")
 
-        monkeypatch.setattr(waiting.os, "get_terminal_size", refuse)
+        monkeypatch.setattr(os, "get_terminal_size", refuse)
         wait.start()
         loop.run_for(1)
         assert said.shown == [(1.0, "[fiber] 0 of 8 pods ready at 1")]

@@ -36,7 +36,8 @@ def told() -> Told:
 
 
 def spec(rig: Rig) -> Body:
-    return rig.pool("warm")["spec"]
+    found: Body = rig.pool("warm")["spec"]
+    return found
 
 
 def owner_uid(rig: Rig) -> str:

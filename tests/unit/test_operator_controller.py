@@ -425,8 +425,8 @@ async def test_a_long_text_of_comma_separated_values_is_one_value(world: World) 
     world.make_pool(replicas=1)
     await world.ready(1)
     (container,) = TEMPLATE["spec"]["containers"]
-    container = {**container, "args": ['a,b\\"[{' * responses.MOST_VALUES]}
-    world.edit(template={"spec": {"containers": [container]}}, replicas=3)
+    other: Body = {**container, "args": ['a,b\\"[{' * responses.MOST_VALUES]}
+    world.edit(template={"spec": {"containers": [other]}}, replicas=3)
     await world.ready(3)
     assert world.reasons() == []
 

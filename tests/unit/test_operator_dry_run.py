@@ -217,8 +217,8 @@ async def test_a_webhook_that_cannot_do_dry_runs_is_no_verdict(world: World) -> 
         def strikes(self, call: Call) -> bool:
             return call.dry_run and super().strikes(call)
 
-    refusal = {"status": 400, "reason": "BadRequest", "message": message}
-    world.api.faults.append(OfDryRuns("create", "pods", times=10**6, **refusal))
+    fault = OfDryRuns("create", "pods", 400, "BadRequest", message, times=10**6)
+    world.api.faults.append(fault)
     world.make_pool(replicas=5)
     await world.ready(5)
     assert world.reasons() == []

@@ -19,19 +19,26 @@ def lease(world: World, namespace: str = names.SERVING_NAMESPACE) -> Body | None
     return next((one for one in found if one["metadata"]["name"] == names.SERVING_LEASE), None)
 
 
+def holder(world: World) -> str | None:
+    """Return the identity in it."""
+    spec = (lease(world) or {"spec": {}})["spec"]
+    identity: str | None = spec.get("holderIdentity")
+    return identity
+
+
 def is_fresh(world: World, namespace: str = names.SERVING_NAMESPACE) -> bool:
     """Return whether a program would take the operator for a living one."""
     spec = (lease(world, namespace) or {"spec": {}})["spec"]
     if not spec:
         return False
-    fresh_until = parse_time(spec["renewTime"]) + spec["leaseDurationSeconds"]
+    fresh_until: float = parse_time(spec["renewTime"]) + spec["leaseDurationSeconds"]
     return world.store.unix_now() < fresh_until
 
 
 @played
 async def test_an_operator_of_all_namespaces_shows_it_in_one(world: World) -> None:
     await world.until(lambda: is_fresh(world), within=10)
-    assert lease(world)["spec"]["holderIdentity"] == "operator-1"
+    assert holder(world) == "operator-1"
     await world.settled(3600)
     assert is_fresh(world)
     renewals = [call for call in world.api.calls if call.namespace == names.SERVING_NAMESPACE]
@@ -65,7 +72,7 @@ def test_a_restart_is_not_seen(graceful: bool) -> None:
             await world.settled(60)
             assert is_fresh(world)
             world.start(identity="operator-2")
-            await world.until(lambda: lease(world)["spec"]["holderIdentity"] == "operator-2")
+            await world.until(lambda: holder(world) == "operator-2")
 
     virtual_time.run(test())
 
@@ -93,7 +100,7 @@ async def test_an_operator_that_is_not_the_leader_writes_no_heartbeat(world: Wor
     stop = asyncio.Event()
     waiting = asyncio.ensure_future(second.run(stop))
     await world.settled(600)
-    assert lease(world)["spec"]["holderIdentity"] == "operator-1"
+    assert holder(world) == "operator-1"
     stop.set()
     await waiting
 

@@ -94,8 +94,8 @@ def test_an_answer_that_is_no_document_is_refused(data: bytes) -> None:
 
 
 def test_an_empty_list_of_metadata_has_null_for_its_items() -> None:
-    document = {"kind": "PartialObjectMetadataList", "metadata": {}, "items": None}
-    assert read(json.dumps(document).encode()) == ([], "")
+    document = b'{"kind": "PartialObjectMetadataList", "metadata": {}, "items": null}'
+    assert read(document) == ([], "")
 
 
 def test_a_list_is_decoded_with_one_object_in_memory() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from threading import Thread
 from typing import Any
 from unittest import mock
@@ -26,9 +26,10 @@ class Far:
 
     def __init__(self) -> None:
         self.loop = SimulatedLoop()
-        self.link: Any = ReadLink()
+        self.link = ReadLink()
+        link: Any = self.link
         nothing: Any = mock.MagicMock()
-        self.agent = RemoteAgent("far", self.link, self.loop, nothing, nothing, nothing)
+        self.agent = RemoteAgent("far", link, self.loop, nothing, nothing, nothing)
         self.observer = Recorder()
         spec = ChildSpec("child", "fork", b"", b"", tasks=True)
         self.child = RemoteChild(self.agent, spec, self.observer)
@@ -43,6 +44,11 @@ class Far:
     def says(self, word: object) -> None:
         """The worker sends a packet."""
         self.agent.on_frame(bytearray(messages.FromChild(1, pickle.dumps(word)).encode()))
+
+    def unread(self) -> Sequence[int]:
+        """The packets that the report of the worker's end names as unread."""
+        assert self.observer.report is not None
+        return self.observer.report.unread
 
     def ends(self, delivered: int) -> None:
         """The worker is gone, after so many packets came in time."""
@@ -131,7 +137,7 @@ def test_a_call_that_the_worker_did_not_get_is_reported_as_unread(far: Far) -> N
     far.ends(delivered=0)
     with pytest.raises(EOFError):
         channel.receive(FOREVER)
-    assert far.observer.report.unread == (7,)
+    assert far.unread() == (7,)
 
 
 def test_the_remembered_packets_of_a_lost_child_are_named_as_unread(
@@ -142,8 +148,7 @@ def test_the_remembered_packets_of_a_lost_child_are_named_as_unread(
     for seq in range(6):
         far.child.deliver(seq, b"call")
     far.ends(delivered=0)
-    assert far.observer.report is not None
-    assert far.observer.report.unread == (2, 3, 4, 5)
+    assert far.unread() == (2, 3, 4, 5)
 
 
 def test_a_call_that_was_not_sent_raises_a_broken_pipe_error(far: Far) -> None:
@@ -154,4 +159,4 @@ def test_a_call_that_was_not_sent_raises_a_broken_pipe_error(far: Far) -> None:
     with pytest.raises(BrokenPipeError):
         channel.receive(FOREVER)
     assert far.sent() == []
-    assert far.observer.report.unread == ()
+    assert far.unread() == ()

@@ -79,7 +79,8 @@ class Rig:
         identity: int = 1,
     ) -> int:
         """Have a batch run; returns its sequence number."""
-        data, beside = b"", []
+        data = b""
+        beside: Sequence[memoryview] = ()
         size = 0
         if function is not None:
             data, beside = work.move_beside((pickle.dumps(function), []))
