@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import os
+import time
 from pathlib import Path
 
 import pytest
 
-from fiber._agent import main
 from fiber._agent.main import Main
 
 
@@ -15,7 +15,7 @@ from fiber._agent.main import Main
 def now(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """Return a list whose last value is the time."""
     times = [100.0]
-    monkeypatch.setattr(main.time, "monotonic", lambda: times[-1])
+    monkeypatch.setattr(time, "monotonic", lambda: times[-1])
     return times
 
 

@@ -70,7 +70,8 @@ def test_an_unused_background_thread_ends_at_once() -> None:
 
 def test_after_stop_submitted_work_is_done_and_new_work_refused() -> None:
     thread = BackgroundThread("test-background")
-    gate, seen = threading.Event(), []
+    gate = threading.Event()
+    seen: list[int] = []
     thread.submit(gate.wait, PATIENCE)
     thread.submit(seen.append, 1)
     thread.stop()
@@ -83,7 +84,8 @@ def test_after_stop_submitted_work_is_done_and_new_work_refused() -> None:
 
 @pytest.mark.parametrize("needed", [True, False])
 def test_the_callback_of_the_end_runs_last(needed: bool) -> None:
-    thread, seen = BackgroundThread("test-background"), []
+    thread = BackgroundThread("test-background")
+    seen: list[int] = []
     if needed:
         thread.submit(seen.append, 1)
     thread.stop(then=lambda: seen.append(2))

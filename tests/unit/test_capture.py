@@ -8,7 +8,7 @@ import queue
 import signal
 import subprocess
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import TypeVar
 
 import pytest
 
@@ -16,6 +16,8 @@ import census
 from fiber._agent.service import LAST_LINES, Capture
 from fiber._transport.loop import Loop
 from patience import PATIENCE
+
+_T = TypeVar("_T")
 
 
 class Captured:
@@ -29,8 +31,8 @@ class Captured:
         self.out = os.dup(self._capture.stdio[0])
         self._on_loop(self._capture.started)
 
-    def _on_loop(self, function: Callable[[], Any]) -> Any:
-        results: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    def _on_loop(self, function: Callable[[], _T]) -> _T:
+        results: queue.SimpleQueue[_T] = queue.SimpleQueue()
         self._loop.call_soon(lambda: results.put(function()))
         return results.get(timeout=PATIENCE)
 

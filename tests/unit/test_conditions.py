@@ -86,7 +86,8 @@ def kill(pid: int) -> None:
 
 @pytest.mark.slow
 def test_the_first_to_come_is_the_first_to_be_notified(brought: Callable[[Any], Any]) -> None:
-    here, woken = fiber.Condition(), []
+    here = fiber.Condition()
+    woken: list[str] = []
     there = brought(here)
     threads = [waiter(condition, woken, name) for condition, name in ((there, "1"), (here, "2"))]
     for count in (1, 2):
@@ -99,7 +100,8 @@ def test_the_first_to_come_is_the_first_to_be_notified(brought: Callable[[Any], 
 
 
 def test_notify_all_wakes_the_waiters_of_both_copies(brought: Callable[[Any], Any]) -> None:
-    here, woken = fiber.Condition(fiber.Lock()), []
+    here = fiber.Condition(fiber.Lock())
+    woken: list[str] = []
     there = brought(here)
     threads = [waiter(condition, woken, "") for condition in (here, there, here, there)]
     # A waiter counts as waiting before it releases the lock, or it could miss a notification.
@@ -167,7 +169,8 @@ def test_wait_and_notify_without_the_lock_are_refused(brought: Callable[[Any], A
 
 
 def test_a_waiter_that_was_killed_is_skipped() -> None:
-    condition, woken = fiber.Condition(), []
+    condition = fiber.Condition()
+    woken: list[str] = []
     pid = fork_that(lambda: condition.acquire() and condition.wait())
     wait_until(lambda: condition._waiters.waiters() == 1, PATIENCE)
     with condition:  # it has let go of it
@@ -181,7 +184,8 @@ def test_a_waiter_that_was_killed_is_skipped() -> None:
 
 
 def test_a_waiter_that_died_elsewhere_is_skipped(hosts: Hosts) -> None:
-    condition, woken = fiber.Condition(), []
+    condition = fiber.Condition()
+    woken: list[str] = []
     there = Far(hosts)(condition)
     place = there._waiters.enter()
     assert condition._waiters.waiters() == 1
@@ -198,9 +202,11 @@ def test_a_remote_notify_wakes_without_the_doorbell(
     hosts: Hosts, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(hosted, "_LOOK", 0.01)
-    condition, woken = fiber.Condition(), []
+    condition = fiber.Condition()
+    woken: list[str] = []
     thread = waiter(Far(hosts)(condition), woken, "far")
-    condition._waiters._ring = lambda: None  # the notifier dies just before
+    # The notifier dies just before it rings.
+    monkeypatch.setattr(condition._waiters, "_ring", lambda: None)
     with condition:
         condition.notify()
     thread.join(PATIENCE)
@@ -307,7 +313,12 @@ def test_a_member_killed_while_it_waits_breaks_the_barrier() -> None:
 @pytest.mark.usefixtures("quick")
 def test_a_member_killed_between_two_waits_breaks_the_barrier() -> None:
     barrier = fiber.Barrier(2)
-    pid = fork_that(lambda: (barrier.wait(PATIENCE), os.kill(os.getpid(), 19)))
+
+    def wait_and_stop() -> None:
+        barrier.wait(PATIENCE)
+        os.kill(os.getpid(), signal.SIGSTOP)
+
+    pid = fork_that(wait_and_stop)
     barrier.wait(PATIENCE)
     os.waitpid(pid, os.WUNTRACED)  # it has stopped, and waits no more
     kill(pid)

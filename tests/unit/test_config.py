@@ -488,7 +488,7 @@ class TestInit:
     def test_init_may_change_keys_for_later_calls_while_fiber_is_in_use(self) -> None:
         config.init(backend="loopback")
         config.guard(lambda: True)
-        config.init(backend="loopback", retries=0, start_timeout=5, log_level="info")
+        config.init(backend="loopback", retries=0, start_timeout=5, log_level="info")  # type: ignore[arg-type]  # any case
         assert config.current().retries == 0
 
     def test_any_backend_while_not_in_use(self) -> None:
@@ -547,7 +547,7 @@ class TestKeysOfTheOriginal:
             load(environ={variable: "1"})
         assert "Did you mean" not in str(env.value)
         with pytest.raises(ConfigError, match=rf"{key!r} in fiber.init\(\) is a key of the orig"):
-            config.init(**{key: 1})
+            config.init(**{key: 1})  # type: ignore[arg-type]  # no such key
         pyproject(f"[tool.fiber]\n{key} = 1")
         with pytest.raises(ConfigError, match=f"{key!r} in .*pyproject.toml is a key of the orig"):
             load()

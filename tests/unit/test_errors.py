@@ -89,7 +89,7 @@ def test_maybe_encoding_error_is_the_pools() -> None:
 
 def test_unknown_names_of_the_module_are_attribute_errors() -> None:
     with pytest.raises(AttributeError, match="Nonsense"):
-        _ = errors.Nonsense
+        _ = errors.Nonsense  # type: ignore[attr-defined]  # there is none
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ from fiber._hub.handles import collecting_grants
 from fiber._hub.protocol import NO_SECRET, SECRET, HubAddress, Op
 from fiber._wire import packet
 from fiber.connection import Connection
+from fiber.queues import JoinableQueue, Queue, SimpleQueue
 from hosts import Hosts, objects_kept
 from patience import PATIENCE
 
@@ -116,7 +117,7 @@ def test_a_pickling_that_failed_leaves_no_grant(hosts: Hosts) -> None:
 
 def test_an_object_keeps_its_descriptors_when_it_is_shared_again(hosts: Hosts) -> None:
     with hosts.at("a") as hub, collecting_grants() as collected:
-        queue = fiber.Queue()
+        queue: Queue[int] = fiber.Queue()
         assert hub.address  # its socket takes one
         before = len(os.listdir("/proc/self/fd"))
         for _ in range(50):
@@ -141,7 +142,9 @@ def test_the_other_end_sees_the_end_once_no_grant_is_left(hosts: Hosts) -> None:
 
 def test_everything_shared_travels(hosts: Hosts) -> None:
     with hosts.at("a"):
-        queue, joinable, simple = fiber.Queue(7), fiber.JoinableQueue(), fiber.SimpleQueue()
+        queue: Queue[int] = fiber.Queue(7)
+        joinable: JoinableQueue[int] = fiber.JoinableQueue()
+        simple: SimpleQueue[int] = fiber.SimpleQueue()
         event, semaphore, bounded = fiber.Event(), fiber.Semaphore(3), fiber.BoundedSemaphore(2)
         things = [queue, joinable, simple, event, semaphore, bounded]
         copies: list[Any] = pickle.loads(pickle.dumps(things))
@@ -161,7 +164,8 @@ def test_everything_shared_travels(hosts: Hosts) -> None:
 def test_without_a_hub_the_error_names_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("_local_hub", "_address", "_starter"):
         monkeypatch.setattr(client, name, None)
-    for shared in (fiber.Pipe()[1], fiber.SimpleQueue()):
+    queue: SimpleQueue[int] = fiber.SimpleQueue()
+    for shared in (fiber.Pipe()[1], queue):
         with pytest.raises(NoHub, match=r"queue, lock or other .* Start a process or pool first"):
             pickle.dumps(shared)
 
@@ -179,8 +183,9 @@ def test_a_program_without_a_hub_makes_one(hosts: Hosts, monkeypatch: pytest.Mon
 
 def test_the_socket_is_private_and_goes_with_the_hub(hosts: Hosts) -> None:
     hub = hosts["a"]
-    assert hub.directory is None
+    unopened = hub.directory
     address = hub.address.path
+    assert unopened is None
     assert hub.directory is not None
     assert hub.address == hub.address
     assert stat.S_IMODE(os.stat(hub.directory).st_mode) == 0o700
@@ -295,8 +300,10 @@ def test_a_hub_without_descriptors_lets_callers_wait(
 ) -> None:
     hub = hosts["a"]
     own = hub.address
-    real, refusals = hub._opened[0][1], []
-    assert real is not None
+    listening = hub._opened[0][1]
+    assert listening is not None
+    real: socket.socket = listening
+    refusals: list[int] = []
 
     class Exhausted:
         def accept(self) -> Any:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import pickle
-from multiprocessing.connection import wait
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from fiber._hub.handles import collecting_grants
 from fiber._hub.local import LocalChannel, LocalCounter
 from fiber._hub.remote import RemoteCounter
 from fiber._hub.streams import WINDOW
-from fiber.connection import Connection
+from fiber.connection import Connection, wait
 from hosts import Far, Hosts, background, objects_kept
 from patience import PATIENCE
 
@@ -145,7 +144,7 @@ def test_wait_mixes_near_and_far(far: Far) -> None:
     readers = [far(reader) if n % 2 else reader for n, (reader, _) in enumerate(pipes)]
     for number, (_, writer) in enumerate(pipes):
         writer.send(number)
-    got = set()
+    got: set[int] = set()
     while len(got) < 4:
         got |= {reader.recv() for reader in wait(readers, PATIENCE)}
     assert got == {0, 1, 2, 3}

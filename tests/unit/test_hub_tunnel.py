@@ -123,7 +123,8 @@ def test_no_more_than_the_window_is_under_way() -> None:
     size = WINDOW // 2
     for _ in range(10):
         ours.send(bytes(size - 1))
-    assert ours.congested
+    congested = ours.congested
+    assert congested
     pair.run()
     assert listener.messages == []
     assert [len(message.payload) for message in theirs._early] == [size - 1] * 2

@@ -40,7 +40,9 @@ def test_links_of_the_readme_lead_somewhere_from_a_package_index(wheel: zipfile.
     (info,) = (each for each in wheel.iterdir() if each.name.endswith(".dist-info"))
     metadata = message_from_string(info.joinpath("METADATA").read_text(encoding="utf-8"))
     assert metadata["Description-Content-Type"] == "text/markdown"
-    links = re.findall(r"\]\(([^)\s]+)", metadata.get_payload())
+    readme = metadata.get_payload()
+    assert isinstance(readme, str)
+    links = re.findall(r"\]\(([^)\s]+)", readme)
     assert [link for link in links if not link.startswith("https://")] == []
     source = PROJECT["urls"]["Source"].removeprefix("https://github.com/")
     places = (
@@ -82,7 +84,7 @@ def test_another_missing_module_is_reported_unchanged() -> None:
         pytest.raises(ModuleNotFoundError, match=r"^No module named 'no_such_module'$"),
         _installation.explained_if_missing("fiber.vector"),
     ):
-        import no_such_module  # noqa: F401
+        import no_such_module  # type: ignore[import-not-found]  # noqa: F401
 
 
 def test_extras_match_their_documentation() -> None:

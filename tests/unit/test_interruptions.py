@@ -12,6 +12,7 @@ import os
 import pickle
 import socket
 import sys
+import tempfile
 import threading
 from collections.abc import Callable
 from functools import partial
@@ -272,9 +273,9 @@ def test_opening_the_hub_within_opening_it(hosts: Hosts, monkeypatch: pytest.Mon
         made.append(mkdtemp(*args, **options))
         return made[-1]
 
-    mkdtemp = hub.tempfile.mkdtemp
+    mkdtemp = tempfile.mkdtemp
     open_again: Any = once(lambda: inner.append(hosts["a"].address), make)
-    monkeypatch.setattr(hub.tempfile, "mkdtemp", open_again)
+    monkeypatch.setattr(tempfile, "mkdtemp", open_again)
     assert without_deadlock(lambda: hosts["a"].address) == inner[0]
     assert [path for path in made if os.path.exists(path)] == [hosts["a"].directory]
 
@@ -286,9 +287,13 @@ def test_a_handler_at_any_line_of_opening_the_hub_may_wait_for_the_loop(hosts: H
         seen: list[Any] = []
         known = threading.Event()
 
+        def see() -> None:
+            seen.append(opening.address)
+            known.set()
+
         def ask() -> None:
             if next(lines) == line:
-                hosts.on_loop(lambda: (seen.append(opening.address), known.set()))
+                hosts.on_loop(see)
                 assert known.wait(PATIENCE)
 
         sys.settrace(striking(ask, {hub.__file__}))
@@ -406,7 +411,7 @@ def test_a_remote_pipe_survives_interruptions(
 
 @pytest.mark.parametrize("kind", [QuietSocket, GrantSet, Wakeup, IMapIterator])
 def test_an_object_whose_construction_was_interrupted_ends_silently(
-    kind: type, monkeypatch: pytest.MonkeyPatch
+    kind: type[object], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told: list[Any] = []
     monkeypatch.setattr(sys, "unraisablehook", told.append)
@@ -493,7 +498,7 @@ def test_a_large_message_within_a_large_message() -> None:
 
     class Interrupting(MessageBlock):
         @property
-        def capacity(self) -> int:  # type: ignore[override]
+        def capacity(self) -> int:
             if not blocks:
                 blocks.append(arena.claim(1000))
             return 1 << 16
@@ -504,7 +509,12 @@ def test_a_large_message_within_a_large_message() -> None:
 
     planted = Interrupting(1 << 16)
     blocks.clear()
-    without_deadlock(lambda: (arena.settle(planted, sent=False), arena.claim(1000)))
+
+    def settle() -> None:
+        arena.settle(planted, sent=False)
+        arena.claim(1000)
+
+    without_deadlock(settle)
     arena._forget()
     for block in {planted, *blocks}:
         if not block.flag.closed:

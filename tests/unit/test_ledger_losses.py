@@ -171,7 +171,7 @@ def test_only_the_running_task_is_charged() -> None:
     ledger.lose(worker, [other.seq for other in unread], (batch.seq, 3))
     assert job.charges.deaths == {3: 1}
     ledger.add("next", 0.0)
-    spans = []
+    spans: list[tuple[int, int]] = []
     while len(spans) < 3:
         batches = assign_all(ledger)
         spans += [(b.start, len(b.items)) for b in batches]

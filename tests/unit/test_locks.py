@@ -27,7 +27,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork:Deprecati
 KINDS = {"mutex": (COUNTING, 1), "recursive": (RECURSIVE, 1), "counting": (COUNTING, SEM_VALUE_MAX)}
 
 
-@pytest.fixture(params=KINDS.values(), ids=KINDS.keys())
+@pytest.fixture(params=list(KINDS.values()), ids=list(KINDS))
 def one(request: pytest.FixtureRequest) -> SharedSemaphore:
     kind, maximum = request.param
     return shared_blocks.create_semaphore(kind, 1, maximum)
@@ -92,7 +92,11 @@ def test_a_try_does_not_wait_for_the_mutex_of_a_revival(one: SharedSemaphore) ->
     entered, leave = threading.Event(), threading.Event()
 
     def hold_mutex() -> None:
-        one._mutex.run(lambda: (entered.set(), leave.wait(PATIENCE)))
+        def hold() -> None:
+            entered.set()
+            leave.wait(PATIENCE)
+
+        one._mutex.run(hold)
 
     holder = threading.Thread(target=hold_mutex)
     holder.start()

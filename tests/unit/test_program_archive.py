@@ -138,7 +138,7 @@ def test_unreadable_files_are_left_out(
         return opening(path, *args)
 
     opening = os.open
-    monkeypatch.setattr(shipping.os, "open", refusing)
+    monkeypatch.setattr(os, "open", refusing)
     archive = packed(folder)
     monkeypatch.undo()
     assert tree(unpacked(archive, tmp_path / "there")) == {
@@ -307,7 +307,7 @@ def test_a_file_that_changes_while_it_is_read_is_read_again_and_else_named(
             os.utime(folder / "main.py", ns=(0, time.time_ns() + len(left)))
         return status
 
-    monkeypatch.setattr(shipping.os, "fstat", changing)
+    monkeypatch.setattr(os, "fstat", changing)
     packed = shipping.pack(layout(folder), found)
     monkeypatch.undo()
     there = unpacked(packed.archive, tmp_path / "there")
@@ -400,7 +400,10 @@ def test_other_kinds_of_members_are_refused(kind: bytes, tmp_path: Path) -> None
 
 
 def test_no_file_is_written_through_a_link(tmp_path: Path) -> None:
-    members = {"a": {"type": tarfile.SYMTYPE, "linkname": "b"}, "a/x": {}}
+    members: dict[str, dict[str, object]] = {
+        "a": {"type": tarfile.SYMTYPE, "linkname": "b"},
+        "a/x": {},
+    }
     with pytest.raises(FileNotFoundError):
         unpacked(archive_of(**members), tmp_path / "there")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sysconfig
 import tempfile
+from multiprocessing import process
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -29,7 +30,7 @@ class Machine:
         self.imported_by: dict[str, str] = {}
         """Fields by which children import the main module."""
         monkeypatch.setenv("HOME", str(self.home))
-        monkeypatch.setattr(program_layout.mp_process, "ORIGINAL_DIR", str(self.es))
+        monkeypatch.setattr(process, "ORIGINAL_DIR", str(self.es))
         # Without the modules that the tests themselves have imported from outside of site-packages.
         self.modules = {"__main__": self.main}
         monkeypatch.setattr(program_layout, "sys", SimpleNamespace(modules=self.modules))

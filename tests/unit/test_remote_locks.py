@@ -45,7 +45,7 @@ def far(hosts: Hosts) -> Far:
     return Far(hosts)
 
 
-@pytest.fixture(params=MAKERS.values(), ids=MAKERS.keys())
+@pytest.fixture(params=list(MAKERS.values()), ids=list(MAKERS))
 def here(request: pytest.FixtureRequest, hosts: Hosts) -> Any:
     with hosts.at("a"):
         return request.param()
@@ -74,8 +74,13 @@ def test_a_lock_of_two_hosts_has_one_holder_at_a_time(here: Any, far: Far) -> No
 def test_a_waiter_elsewhere_gets_the_lock(here: Any, far: Far) -> None:
     there = far(here)
     got: list[Any] = []
+
+    def take() -> None:
+        got.append(there.acquire())
+        there.release()
+
     with here:
-        waiters = [background(lambda: (got.append(there.acquire()), there.release())) for _ in "ab"]
+        waiters = [background(take) for _ in "ab"]
     for waiter in waiters:
         waiter.join(PATIENCE)
     assert got == [True, True]
@@ -224,7 +229,12 @@ def test_a_remote_lock_waits_while_its_link_is_cut(here: Any) -> None:
             for wire in wires:
                 hosts.on_loop(wire.hold)
             acquired = threading.Event()
-            waiting = background(lambda: (there.acquire(), acquired.set()))
+
+            def acquire() -> None:
+                there.acquire()
+                acquired.set()
+
+            waiting = background(acquire)
             assert not acquired.wait(0.05)
             for wire in wires:
                 hosts.on_loop(wire.let_go)

@@ -186,6 +186,9 @@ class Asker:
     def refused(self, reason: str) -> None:
         self.reason = reason
 
+    def is_refused(self) -> bool:
+        return bool(self.reason)
+
 
 @pytest.fixture
 def replicas(hosts: Hosts) -> Iterator[Replicas]:
@@ -213,7 +216,7 @@ def test_objects_of_others_cannot_be_used_without_their_secrets(far: Far, hosts:
         (replica,) = replicas._replicas.values()
         wrong = Origin("a", NO_SECRET, replica.block.size, NO_SECRET, NO_SECRET)
         hosts.on_loop(replicas.join, wrong, asker, asker)
-        assert wait_until(lambda told=asker: bool(told.reason), PATIENCE)
+        assert wait_until(asker.is_refused, PATIENCE)
         assert "is gone" in asker.reason
     assert list(other) == [0, 0, 0]
 
@@ -221,9 +224,9 @@ def test_objects_of_others_cannot_be_used_without_their_secrets(far: Far, hosts:
 def test_a_block_is_had_as_a_whole_or_not_at_all(replicas: Replicas, hosts: Hosts) -> None:
     block = memory_of(fiber.RawArray("i", 4))
     home, extent = buffer_of_handle(block)
-    for wrong in ((home.identity, 1 << 20), (NO_SECRET, extent.size)):
+    for identity, size in ((home.identity, 1 << 20), (NO_SECRET, extent.size)):
         asker = Asker()
-        replicas.join(Origin("a", *wrong, NO_SECRET, home.grant), 1, asker)
+        replicas.join(Origin("a", identity, size, NO_SECRET, home.grant), 1, asker)
         assert "no such block" in asker.reason
 
 

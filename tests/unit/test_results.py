@@ -29,7 +29,7 @@ class Stop(BaseException):
     """Exception that a signal's handler raises."""
 
 
-def result() -> ApplyResult:
+def result() -> ApplyResult[Any]:
     pool: Any = None
     return ApplyResult(pool)
 
@@ -81,7 +81,7 @@ def test_a_latch_wakes_all_waiters() -> None:
     assert found.get() == 1
 
 
-def iterator() -> IMapIterator:
+def iterator() -> IMapIterator[Any]:
     pool: Any = None
     return IMapIterator(pool)
 
@@ -194,6 +194,7 @@ def test_unread_results_are_held_back_at_a_cost_independent_of_their_number(
 ) -> None:
     monkeypatch.setattr(results, "HELD", 1000)
     pool: Any = None
+    found: IMapIterator[int]
     found = IMapIterator(pool) if ordered else IMapUnorderedIterator(pool)
     buffer, looked_at = found._buffer, 0
     buffer.resume = lambda: None
@@ -232,7 +233,7 @@ def test_a_map_whose_getting_is_interrupted_at_any_step_raises_its_error_the_nex
 
     def get_twice(stop: int) -> bool:
         """Return whether the first was interrupted, at step ``stop``."""
-        found = MapResult(pool)
+        found: MapResult[int] = MapResult(pool)
         found.add_results(0, [1, outcome, 3], True)
         found.set_done()
 
@@ -259,9 +260,13 @@ def test_an_iterator_raises_a_failed_task_and_goes_on_with_the_next() -> None:
 
 def test_an_iterator_that_is_dropped_lets_go_of_results_that_wait_for_an_earlier_one() -> None:
     pool: Any = None
-    iterator = IMapIterator(pool)
+    iterator: IMapIterator[Any] = IMapIterator(pool)
     buffer = iterator._buffer
-    buffer.resume = buffer.has_room  # as the executor would, later
+
+    def resume() -> None:
+        buffer.has_room()  # as the executor would, later
+
+    buffer.resume = resume
     outcome = Pickled(work.VALUE, b"", [])
     holders = sys.getrefcount(outcome)
     buffer.add_results(1, [outcome], True)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import select
 import threading
 from collections.abc import Callable, Iterator
-from multiprocessing.connection import wait
 from queue import Empty, Full
 from typing import Any
 
@@ -18,7 +17,7 @@ import pytest
 import fiber
 from census import wait_until
 from fiber._hub.remote import RemoteChannel
-from fiber.connection import Connection
+from fiber.connection import Connection, wait
 from fiber.errors import ConnectionClosed
 from hosts import Far, background
 from patience import PATIENCE
