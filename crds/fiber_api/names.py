@@ -26,7 +26,7 @@ CRD_NAME: Final = f"{PLURAL}.{GROUP}"
 # -- Writers: field managers of server-side apply, and the value of LABEL_MANAGED_BY
 
 SDK_MANAGER: Final = "fiber-sdk"
-"""Owner of ``spec.replicas``, ``spec.scaleDown.release`` and ``spec.master``."""
+"""Owner of ``spec.replicas``, ``spec.scaleDown.release``, ``spec.master`` and ``spec.relay``."""
 OPERATOR_MANAGER: Final = "fiber-operator"
 """Owner of the status, the pods, the Service, its EndpointSlice and the Secret, unless
 ``spec.credentialsSecretName`` names one; never of the spec."""
@@ -123,6 +123,20 @@ MASTER_PORT: Final = 7070
 MASTER_PORT_NAME: Final = "fiber"
 ENDPOINT_SCHEME: Final = "tls+tcp"
 
+# -- The relay, for programs that pods cannot reach
+
+LABEL_RELAY: Final = f"{GROUP}/relay"
+"""Label of the relay's pod, with the uid of its pool. The Service selects the pod by it."""
+ANNOTATION_RELAY_HASH: Final = f"{GROUP}/relay-hash"
+"""Annotation of the relay's Deployment: hash of the body that the operator wrote."""
+RELAY_CONTAINER: Final = "relay"
+RELAY_PORT: Final = 7071
+"""Port on the loopback of the relay's pod, to which the master opens a port-forward. The relay
+listens for agents at MASTER_PORT."""
+ENV_RELAY_AGENTS_PORT: Final = "FIBER_RELAY_AGENTS_PORT"
+"""Port for agents. A worker's command that has this variable is a relay."""
+ENV_RELAY_MASTER_PORT: Final = "FIBER_RELAY_MASTER_PORT"
+
 # -- The Secret: its keys
 
 KEY_POOL: Final = "key"
@@ -208,6 +222,11 @@ def pool_of_secret(secret: str) -> str | None:
     """Return the pool for whose key the name ``secret`` is reserved; None if there is none."""
     found = _SECRET_NAME.fullmatch(secret)
     return None if found is None else found[1]
+
+
+def relay_name(pool: str) -> str:
+    """Return the name of the Deployment of the pool's relay: at most 62 characters."""
+    return f"{pool}-fiber-relay"
 
 
 def master_lease_name(pool: str) -> str:
@@ -393,5 +412,7 @@ class Reason(StrEnum):
     REPLACED = "Replaced"
     RECOVERED = "Recovered"
     MASTER_CHANGED = "MasterChanged"
+    RELAY_STARTED = "RelayStarted"
+    RELAY_REMOVED = "RelayRemoved"
     SERVED_TWICE = "ServedTwice"
     """Another program writes the pool's status: probably a second operator."""

@@ -65,6 +65,7 @@ SERVICES = ResourceType("v1", "Service", "services")
 SECRETS = ResourceType("v1", "Secret", "secrets")
 EVENTS = ResourceType("v1", "Event", "events")
 SLICES = ResourceType("discovery.k8s.io/v1", "EndpointSlice", "endpointslices")
+DEPLOYMENTS = ResourceType("apps/v1", "Deployment", "deployments")
 BUDGETS = ResourceType("policy/v1", "PodDisruptionBudget", "poddisruptionbudgets")
 LEASES = ResourceType("coordination.k8s.io/v1", "Lease", "leases")
 

@@ -523,6 +523,7 @@ class Controller:
             secret=dependents.secret if dependents else None,
             obstacles=dependents.obstacles if dependents else (),
             led=dependents is None or dependents.master == pool.spec.master,
+            relay=dependents.relay_name if dependents else None,
             creation=state.creation,
             deletion=state.deletion,
             accepted=state.accepted,

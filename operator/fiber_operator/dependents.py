@@ -1,4 +1,4 @@
-"""Objects of a pool beside its pods: Service, EndpointSlice, Secret, and PodDisruptionBudget.
+"""Objects of a pool beside its workers: Service, EndpointSlice, Secret, PodDisruptionBudget, relay.
 
 They are checked when the operator first sees a pool, every ``CHECK_INTERVAL`` seconds, and in each
 reconcile while something is wrong with them.  Between the checks only a new master causes a call.
@@ -18,6 +18,7 @@ from fiber_api import identity, names, signatures
 from fiber_api.names import Reason
 from fiber_api.rest import (
     BUDGETS,
+    DEPLOYMENTS,
     SECRETS,
     SERVICES,
     SLICES,
@@ -31,7 +32,7 @@ from fiber_api.rest import (
 )
 from fiber_api.v1alpha1 import FiberPool, MasterSpec
 from fiber_operator.cluster import MAY_PASS, Cluster
-from fiber_operator.planning import manifests, messages
+from fiber_operator.planning import manifests, messages, relay
 from fiber_operator.planning.documents import items, mapping, seconds, text
 from fiber_operator.planning.plans import Obstacle, PoolSecret
 
@@ -55,6 +56,8 @@ class Dependents:
     """The pool's Secret; None if ``credentials`` is False."""
     budget: int | None = None
     """Value of the PodDisruptionBudget.  None: there is none.  0: not known."""
+    relay_name: str | None = ""
+    """Name of the relay's Deployment.  Empty: there is none.  None: not known."""
     failure: ApiError | None = None
     """Error of a call with an unknown outcome, to be raised after the status was written."""
 
@@ -129,7 +132,9 @@ class DependentsReconciler:
         fresh = known is not None and self._now() - known.checked < CHECK_INTERVAL
         complete = known is None or not fresh or bool(known.obstacles)
         if known is not None and not complete:
-            if (known.master, known.budget) == (pool.spec.master, pool.spec.min_available):
+            spec = pool.spec
+            there = (known.master, known.budget, known.relay_name)
+            if there == (spec.master, spec.min_available, _wanted_relay(pool)):
                 return known
             address, secret, checked = known.address, known.secret, known.checked
             whole = known.credentials
@@ -143,7 +148,11 @@ class DependentsReconciler:
         budgeted = _concerns_budget(pool, known)
         if budgeted:
             steps.append((f"the PodDisruptionBudget {names.budget_name(name)}", self._budget))
-        found = await _all(*(self._attempt(pool, *step) for step in steps))
+        relayed = pool.spec.relay or _may_have_relay(pool, known)
+        if relayed:
+            steps.insert(0, (f"the Deployment {names.relay_name(name)}", self._relay))
+        outcomes = await _all(*(self._attempt(pool, *step) for step in steps))
+        relay_found, *found = outcomes if relayed else (_Found(), *outcomes)
         if complete:
             service, made = found[1].value, found[2].value
             address = service if isinstance(service, str) else None
@@ -153,13 +162,14 @@ class DependentsReconciler:
         before = known.master if known is not None else None
         return Dependents(
             address,
-            tuple(step.obstacle for step in found if step.obstacle is not None),
+            tuple(step.obstacle for step in outcomes if step.obstacle is not None),
             pool.spec.master if led else before,
             checked,
             whole,
             secret,
             0 if budgeted and found[-1].obstacle is not None else pool.spec.min_available,
-            next((step.failure for step in found if step.failure is not None), None),
+            None if relay_found.obstacle is not None else _wanted_relay(pool),
+            next((step.failure for step in outcomes if step.failure is not None), None),
         )
 
     async def _attempt(self, pool: FiberPool, what: str, step: _Step) -> _Found:
@@ -226,8 +236,11 @@ class DependentsReconciler:
         wanted = manifests.service(pool)
         existing = await self._have_service(pool, name, wanted)
         spec = mapping(existing, "spec")
-        if spec.get("selector") or not _has_ports(spec, wanted["spec"]["ports"]):
-            patch = {"spec": {"selector": None, "ports": wanted["spec"]["ports"]}}
+        foreign = spec.get("selector") and spec.get("selector") != relay.selector(pool)
+        if foreign or not _has_ports(spec, wanted["spec"]["ports"]):
+            patch = {"spec": {"ports": wanted["spec"]["ports"]}}
+            if foreign:
+                patch["spec"]["selector"] = None
             await self._cluster.patch(SERVICES, namespace, name, patch)
         host = spec.get("clusterIP")
         if not isinstance(host, str) or host in ("", "None"):
@@ -269,25 +282,47 @@ class DependentsReconciler:
         if patch is not None:
             await self._cluster.patch(SLICES, namespace, name, patch)
 
+    async def _relay(self, pool: FiberPool) -> None:
+        """Make the relay and have the Service select its pod, or remove the relay.
+
+        The selector stays when the relay goes.  Kubernetes then removes the pod's address from the
+        Service, which it would not do for a Service without a selector.
+        """
+        name, namespace = names.relay_name(pool.metadata.name), pool.metadata.namespace
+        if not pool.spec.relay:
+            await self._remove(pool, DEPLOYMENTS, name)
+            return
+        wanted = relay.deployment(pool)
+        existing = await self._have(pool, DEPLOYMENTS, name, lambda: wanted)
+        if not relay.is_current(existing, wanted):
+            await self._remove(pool, DEPLOYMENTS, name)
+            await self._cluster.create(DEPLOYMENTS, namespace, wanted)
+        service = names.service_name(pool.metadata.name)
+        found = await self._have(pool, SERVICES, service, lambda: manifests.service(pool))
+        if mapping(found, "spec").get("selector") != relay.selector(pool):
+            patch = {"spec": {"selector": relay.selector(pool)}}
+            await self._cluster.patch(SERVICES, namespace, service, patch)
+
     async def _budget(self, pool: FiberPool) -> None:
         name, namespace = names.budget_name(pool.metadata.name), pool.metadata.namespace
         if pool.spec.min_available is None:
-            await self._remove_budget(pool, name)
+            await self._remove(pool, BUDGETS, name)
             return
         wanted = manifests.budget(pool)
         existing = await self._have(pool, BUDGETS, name, lambda: wanted)
         if not wanted["spec"].items() <= mapping(existing, "spec").items():
             await self._cluster.patch(BUDGETS, namespace, name, {"spec": wanted["spec"]})
 
-    async def _remove_budget(self, pool: FiberPool, name: str) -> None:
+    async def _remove(self, pool: FiberPool, resource: ResourceType, name: str) -> None:
+        """Delete an object of the pool, if it exists."""
         namespace = pool.metadata.namespace
         try:
-            existing = await self._cluster.read(BUDGETS, namespace, name)
+            existing = await self._cluster.read(resource, namespace, name)
         except (NotFound, Forbidden):
             return  # without the right to read one, the operator has made none
         if manifests.is_ours(pool, existing):
             uid = str(mapping(existing, "metadata").get("uid"))
-            await self._cluster.delete(BUDGETS, namespace, name, uid=uid)
+            await self._cluster.delete(resource, namespace, name, uid=uid)
 
     async def _have(
         self, pool: FiberPool, resource: ResourceType, name: str, new: Callable[[], Body]
@@ -328,6 +363,14 @@ def _signer(pool: FiberPool, secret: Body, remedy: str) -> signatures.Signer | N
         name = text(mapping(secret, "metadata").get("name"))
         message = f"the Secret {name} has no valid key: {error}. {remedy}."
         raise _Obstructed(Obstacle(Reason.INVALID_CREDENTIALS, message, True)) from None
+
+
+def _wanted_relay(pool: FiberPool) -> str:
+    return names.relay_name(pool.metadata.name) if pool.spec.relay else ""
+
+
+def _may_have_relay(pool: FiberPool, known: Dependents | None) -> bool:
+    return bool(pool.status.relay) if known is None else known.relay_name != ""
 
 
 def _concerns_budget(pool: FiberPool, known: Dependents | None) -> bool:

@@ -19,6 +19,9 @@ It is configured by its environment.  The command line takes ``--help`` only:
 ``FIBER_AGENT_TERMINATION_GRACE``  optional: seconds from SIGTERM to the end by force.  After
                            SIGTERM the agent takes no new work.  Running tasks may end in that
                            time, less the time for cleaning up
+``FIBER_RELAY_AGENTS_PORT``  optional: relay between agents and a master, and run no agent.  The
+                           port for agents
+``FIBER_RELAY_MASTER_PORT``  the port on the loopback for the master of a relay
 ``FIBER_AGENT_LINKED``       optional: a file to make once a master has answered
 ``FIBER_START_TIMEOUT``      seconds to find the master, as for every Fiber process
 
@@ -49,6 +52,10 @@ def _run(arguments: Sequence[str]) -> int:
         from fiber._transport import credentials_file
 
         return credentials_file.write(os.environ)
+    if "FIBER_RELAY_AGENTS_PORT" in os.environ:
+        from fiber._transport import relay
+
+        return relay.run(os.environ)
     # The agent is process 1 of a container.  The kernel drops a SIGTERM for which process 1 has no
     # handler, and then a deleted pod ends by force after its grace period.  A blocked signal waits.
     # So this comes before the imports, which take most of the time.

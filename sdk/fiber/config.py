@@ -166,6 +166,7 @@ def _key(default: Any, rule: _Rule, *, fixed: bool = False) -> Any:
 
 
 Backend = Literal["local", "loopback", "kubernetes", "auto"]
+Relay = Literal["auto", "always", "never"]
 LogLevel = Literal["DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL"]
 
 
@@ -218,6 +219,9 @@ class Config:
         A range such as "9000-9009" takes the first free one: for several programs on one host.
     advertised_host*: the address that pods dial if it is not the one above, as behind NAT or
         port forwarding. The port is the same. None means the address above.
+    relay*: whether agents connect to a relay, a small pod in the cluster that the program reaches
+        through the API server. "auto": if no agent of a running pod reaches the program within
+        seconds. "always": without that attempt. "never": not at all.
     start_timeout: seconds that a process or an agent may take to start.
     heartbeat_interval*: seconds between two heartbeats of an agent.
     suspect_after*: seconds of silence after which an agent gets no new work.
@@ -261,6 +265,7 @@ class Config:
     listen_host: str | None = _key(None, _word("a host name or address"), fixed=True)
     listen_port: int | str = _key(0, _ports(), fixed=True)
     advertised_host: str | None = _key(None, _word("a host name or address"), fixed=True)
+    relay: Relay = _key("auto", _choice(*get_args(Relay)), fixed=True)  # noqa: RUF009 - a field
     start_timeout: float = _key(60.0, _seconds())
     heartbeat_interval: float = _key(1.0, _seconds(), fixed=True)
     suspect_after: float = _key(5.0, _seconds(), fixed=True)
@@ -298,6 +303,7 @@ if TYPE_CHECKING:
         listen_host: str | None
         listen_port: int | str
         advertised_host: str | None
+        relay: Relay
         start_timeout: float
         heartbeat_interval: float
         suspect_after: float

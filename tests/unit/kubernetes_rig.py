@@ -15,7 +15,7 @@ import yaml
 from fakes.kubernetes_api import Call
 from fakes.served import Served, served
 from fiber._backends.kubernetes.api import Api
-from fiber._backends.kubernetes.attached_pool import OwnPool, PoolMaster, WarmPool
+from fiber._backends.kubernetes.attached_pool import AttachedPool, OwnPool, PoolMaster, WarmPool
 from fiber._backends.kubernetes.fiber_pool import FiberPoolClient
 from fiber._transport.credentials import make_certificate, make_credentials
 from fiber._transport.loop import Loop
@@ -78,7 +78,7 @@ class Told:
     def connected(self) -> int:
         return self.agents
 
-    def on_attached(self) -> None:
+    def on_attached(self, pool: AttachedPool) -> None:
         self._note(self.attached, True)
 
     def on_status(self, status: Body) -> None:

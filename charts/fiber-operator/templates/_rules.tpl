@@ -32,6 +32,10 @@ pools:
   - apiGroups: [discovery.k8s.io]
     resources: [endpointslices]
     verbs: [create, delete, get, patch]
+  # For pools whose master pods cannot reach (spec.relay).
+  - apiGroups: [apps]
+    resources: [deployments]
+    verbs: [create, delete, get]
   # For pools with spec.minAvailable.
   - apiGroups: [policy]
     resources: [poddisruptionbudgets]
@@ -84,6 +88,11 @@ user:
   - apiGroups: [""]
     resources: [pods]
     verbs: [get, list, watch]
+  # The way to the relay of a pool, for a program that pods cannot reach. A WebSocket begins with a GET, and newer API
+  # servers also ask for the right to create. Kubernetes cannot restrict the right to the pods of relays.
+  - apiGroups: [""]
+    resources: [pods/portforward]
+    verbs: [create, get]
   # Whether workers on other nodes can mount the claims of that pod.
   - apiGroups: [""]
     resources: [persistentvolumeclaims]

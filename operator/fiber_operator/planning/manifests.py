@@ -56,7 +56,8 @@ def endpoint_slice(pool: FiberPool) -> dict[str, Any]:
         "kind": "EndpointSlice",
         "metadata": metadata,
         "addressType": _family(pool.spec.master),
-        "endpoints": _endpoints(pool.spec.master),
+        # With a relay, the Service selects the relay's pod instead.
+        "endpoints": [] if pool.spec.relay else _endpoints(pool.spec.master),
         "ports": _ports(pool.spec.master),
     }
 

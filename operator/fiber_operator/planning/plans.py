@@ -132,6 +132,8 @@ class Knowledge:
     """The pool's Secret; None if there is none, or it was not checked."""
     obstacles: tuple[Obstacle, ...] = ()
     """Obstacles of the pool's objects.  While there is one, no pod is created."""
+    relay: str | None = None
+    """Name of the relay's Deployment; empty if there is none, None if that was not checked."""
     led: bool = True
     """True if the EndpointSlice leads to ``spec.master``."""
     creation: Obstacle | None = None

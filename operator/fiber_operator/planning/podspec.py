@@ -101,7 +101,7 @@ def _pod(
     # Else each worker would get environment variables for each Service of the namespace.
     _default(spec, "enableServiceLinks", False)
     spec["tolerations"] = _tolerations(spec.get("tolerations"))
-    _secure(spec)
+    secure(spec)
     variables = _variables(pool, spec, name, address, revision)
     for container in _containers(spec, "containers"):
         if container.get("name") == pool.spec.worker_container:
@@ -169,7 +169,8 @@ def _tolerations(own: object) -> object:
 # Security, as the "restricted" level of Kubernetes' pod security standards demands.
 
 
-def _secure(spec: dict[str, Any]) -> None:
+def secure(spec: dict[str, Any]) -> None:
+    """Add the security contexts that the template leaves out."""
     context = _default(spec, "securityContext", {})
     if not isinstance(context, dict):
         return
@@ -342,16 +343,25 @@ def _add_identity_container(pool: FiberPool, spec: dict[str, Any], worker: dict[
     worker["volumeMounts"] = [*mounts, mount]
 
 
-def _identity_container(
-    pool: FiberPool, worker: Mapping[str, Any], written: Mapping[str, Any]
-) -> dict[str, Any]:
+def command_of(worker: Mapping[str, Any]) -> dict[str, Any]:
+    """Return image, command and security context of a container that runs Fiber as ``worker`` does.
+
+    Variables of the environment then say what Fiber does there.
+    """
     made = {k: copy.deepcopy(worker[k]) for k in _LIKE_THE_WORKER if worker.get(k) is not None}
-    made["name"] = names.IDENTITY_CONTAINER
     if not _runs_the_agent(worker):
         made.pop("args", None)
         made["command"] = ["python", "-m", _AGENT]
+    return made
+
+
+def _identity_container(
+    pool: FiberPool, worker: Mapping[str, Any], written: Mapping[str, Any]
+) -> dict[str, Any]:
+    made = command_of(worker)
+    made["name"] = names.IDENTITY_CONTAINER
     made["volumeMounts"] = [
-        *_mounts_of_the_interpreter(worker, made),
+        *mounts_of_the_interpreter(worker, made),
         dict(written),
         {"name": names.KEY_VOLUME, "mountPath": names.KEY_DIRECTORY, "readOnly": True},
     ]
@@ -373,7 +383,7 @@ def _highest_epoch(pool: FiberPool) -> int:
     return max(present, pool.status.master_epoch or 0)
 
 
-def _mounts_of_the_interpreter(
+def mounts_of_the_interpreter(
     worker: Mapping[str, Any], made: Mapping[str, Any]
 ) -> Iterator[dict[str, Any]]:
     """Yield the mounts that the command needs because it names a path on them."""

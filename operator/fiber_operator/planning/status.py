@@ -310,6 +310,7 @@ def describe(facts: Assessment, outlook: Outlook, account: Account) -> FiberPool
         selector=manifests.selector(pool),
         endpoint=names.endpoint_of(knowledge.address) if knowledge.address else before.endpoint,
         master=leads_to if knowledge.led else before.master,
+        relay=before.relay if knowledge.relay is None else knowledge.relay or None,
         master_epoch=max(epoch, before.master_epoch or 0) or None,
         master_signature=_master_signature(facts),
         public_key=_public_key(facts),
@@ -484,6 +485,7 @@ def events(change: Change, *, status_changes: bool) -> Iterator[PoolEvent]:
         yield from _disruptions(change)
         yield from _problems(change)
         yield from _masters(change)
+        yield from _relays(change)
 
 
 _DELETIONS = {
@@ -535,6 +537,15 @@ def _masters(change: Change) -> Iterator[PoolEvent]:
     else:
         message = "The master has left; the workers wait for the next one"
     yield PoolEvent("Normal", Reason.MASTER_CHANGED, message)
+
+
+def _relays(change: Change) -> Iterator[PoolEvent]:
+    before, after = change.before.relay, change.after.relay
+    if after and not before:
+        message = f"Workers dial the relay {after}, since pods cannot reach the master"
+        yield PoolEvent("Normal", Reason.RELAY_STARTED, message)
+    elif before and not after:
+        yield PoolEvent("Normal", Reason.RELAY_REMOVED, f"The relay {before} was removed")
 
 
 def _without_output(message: str) -> str:

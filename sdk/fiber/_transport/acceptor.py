@@ -128,8 +128,11 @@ class Acceptor:
                 self._past = (*self._past, past)[-_PAST:]
 
     def take(self, sock: socket.socket, origin: str) -> None:
-        """Treat a connection from elsewhere, for example from a relay, as if it were accepted."""
-        self.loop.call_soon(self._admit, sock, origin, origin)
+        """Treat a connection from ``origin``, ``host:port``, as if it were accepted.
+
+        For connections that come another way, for example through a relay.
+        """
+        self.loop.call_soon(self._admit, sock, origin.rpartition(":")[0], origin)
 
     def close(self) -> None:
         """Stop accepting, and close pending connections.  Do not call it on its own thread."""

@@ -78,6 +78,11 @@ class MasterListener:
         )
         self._acceptor.add(self._served)
 
+    def be_patient(self, lost_after: float) -> None:
+        """Count new agents as lost after so many seconds of silence, at least.  The loop thread."""
+        longer = max(lost_after, self._keepalive.lost_after)
+        self._keepalive = self._keepalive._replace(lost_after=longer)
+
     def take(self, sock: socket.socket, origin: str) -> None:
         """Serve a connection to an agent that did not come through ``address``."""
         self._acceptor.take(sock, origin)

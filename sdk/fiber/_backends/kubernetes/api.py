@@ -21,6 +21,7 @@ from collections.abc import Iterator, Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict, Unpack
 
+from fiber._backends.kubernetes.port_forward import PortForward, PortForwardRequest
 from fiber.errors import ConfigError
 from fiber_api import names
 from fiber_api.rest import (
@@ -145,6 +146,11 @@ class Api:
         }
         return Watch(self._session, ApiRequest("GET", path, query))
 
+    def port_forward(self, pod: str, port: int) -> PortForward:
+        """Connect to a port on the loopback of the pod at the path ``pod``."""
+        query = {"ports": str(port)}
+        return self._session.port_forward(ApiRequest("GET", f"{pod}/portforward", query))
+
     def _call(
         self,
         request: ApiRequest,
@@ -268,19 +274,33 @@ class ApiSession:
         response = self._send_by(client, request, read_timeout)
         if response.status != 401:
             return response
-        # The package renews tokens that have expired.  Only this answer shows that a token was
-        # revoked, or has expired without the plugin saying when.
         response.close()
+        self._log_in_again(client)
+        return self._send_by(self._client, request, read_timeout)
+
+    def port_forward(self, request: ApiRequest) -> PortForward:
+        """Open the port-forward that the request asks for."""
+        client = self._client
+        try:
+            return self._port_forward_by(client, request)
+        except Unauthorized:
+            self._log_in_again(client)
+            return self._port_forward_by(self._client, request)
+
+    def _log_in_again(self, client: ApiClient) -> None:
+        """Replace a client that the API server does not know.
+
+        The package renews tokens that have expired.  Only the answer 401 shows that a token was
+        revoked, or has expired without the plugin saying when.
+        """
         with self._lock:
             if self._client is client:
                 with _login_errors():
                     self._client = self.login.client()
                 client.close()
-        return self._send_by(self._client, request, read_timeout)
 
-    def _send_by(
-        self, client: ApiClient, request: ApiRequest, read_timeout: float
-    ) -> BaseHTTPResponse:
+    def _serialize(self, client: ApiClient, request: ApiRequest) -> tuple[str, str, dict[str, str]]:
+        """Return method, URL and headers."""
         with self._lock, _login_errors():  # it may run a plugin that logs in: one at a time
             method, url, headers, _, _ = client.param_serialize(
                 request.method,
@@ -289,6 +309,31 @@ class ApiSession:
                 header_params={"Accept": "application/json", "Content-Type": request.content_type},
                 auth_settings=["BearerToken"],
             )
+        return method, url, headers
+
+    def _port_forward_by(self, client: ApiClient, request: ApiRequest) -> PortForward:
+        _, url, headers = self._serialize(client, request)
+        configuration = client.configuration
+        proxy: dict[str, Any] = {}
+        if configuration.proxy:
+            parts = urllib.parse.urlsplit(configuration.proxy)
+            proxy = {
+                "http_proxy_host": parts.hostname,
+                "http_proxy_port": parts.port,
+                "proxy_type": "http",
+            }
+        return PortForwardRequest(
+            url.replace("http", "ws", 1),
+            {name.lower(): value for name, value in headers.items()}.get("authorization"),
+            client.rest_client.pool_manager.connection_pool_kw["ssl_context"],
+            configuration.tls_server_name,
+            proxy,
+        ).connect(CONNECT_TIMEOUT)
+
+    def _send_by(
+        self, client: ApiClient, request: ApiRequest, read_timeout: float
+    ) -> BaseHTTPResponse:
+        method, url, headers = self._serialize(client, request)
         # The package must not see the body, in which it would look for its models.
         with network_errors():
             answer = client.call_api(

@@ -53,6 +53,8 @@ class PoolMaster:
     """SHA-256 of the certificate that the program shows the agents, in hexadecimal digits."""
     lease_duration: int = 30
     lost_grace: int = 60
+    relay: bool = False
+    """True if agents are to connect to a relay from the start."""
 
     @property
     def address(self) -> str:
@@ -101,6 +103,8 @@ class AttachedPool:
         """Function for any thread that returns the number of linked agents, for the Lease."""
         self._acquired = ""
         """Time in the Lease that this program made."""
+        self.relay = bool(found["spec"].get("relay"))
+        """True if agents are to connect to a relay instead of this program."""
         self.generation = int(metadata["generation"])
         """Generation of the spec that this program wrote last."""
 
@@ -136,6 +140,8 @@ class AttachedPool:
             spec["scaleDown"] = {"release": names_to_release}
         if master:
             spec["master"] = self.master.spec(self.name, self.epoch)
+        if master and self.relay:
+            spec["relay"] = True
         body = {
             "apiVersion": names.API_VERSION,
             "kind": names.KIND,
@@ -404,6 +410,8 @@ class OwnPool:
             "onLost": "Delete",
             "credentialsSecretName": self._secret,
         }
+        if self._master.relay:
+            spec["relay"] = True
         body = {**self._body, "metadata": metadata, "spec": spec}
         try:
             return self._api.create(POOLS.path(self.namespace), body, strict=True, cancel=cancel)
@@ -510,6 +518,7 @@ class WarmPool:
         self.displaced = str(there.get("identity") or there.get("host") or "")
         seen = int((found.get("status") or {}).get("masterEpoch") or 0)
         attached = self._as_master(found, 1 + max(epoch, seen))
+        attached.relay = self._master.relay
         self._replicas = 0 if there else int(found["spec"].get("replicas") or 0)
         version = found["metadata"]["resourceVersion"]
         # First: if the call fails, ``detach`` checks whether it took effect.

@@ -18,10 +18,11 @@ from typing import Any
 from fiber._agent.interface import ChildObserver, ChildSpec
 from fiber._backends.agent_set import AgentSet
 from fiber._backends.kubernetes.api import Api
-from fiber._backends.kubernetes.attached_pool import LOST
+from fiber._backends.kubernetes.attached_pool import LOST, AttachedPool
 from fiber._backends.kubernetes.fiber_pool import FiberPoolClient
 from fiber._backends.kubernetes.problems import AgentRoute, PoolName, node_of, pod_end
 from fiber._backends.kubernetes.provisioner import ListenerObserver, PoolProvisioner, PreparedPool
+from fiber._backends.kubernetes.relay_tunnel import RelayedPool, RelayTunnel
 from fiber._backends.kubernetes.template import PodShape
 from fiber._backends.kubernetes.waiting import Preparation, WaitingChildren
 from fiber._backends.remote import RemoteAgent, RemoteChild
@@ -100,6 +101,11 @@ class KubernetesBackend:
 _END_TIMEOUT = 10.0
 """Seconds that the API server may take at the end, and seconds for the agents."""
 
+RELAY_LOST_AFTER = 120.0
+"""Seconds of silence after which an agent behind a relay counts as lost, at least.  A laptop that
+sleeps or changes its network is silent for longer than a master in the cluster.  Pods that end are
+known from the API server sooner."""
+
 _ENDED = ("Failed", "Succeeded")
 
 _NOT_OURS = "its FiberPool no longer belongs to this program"
@@ -141,8 +147,16 @@ class Pods:
             loop, hub, output, self._placement, on_change=self._changed, on_lost=self._lost
         )
         self._waiting = WaitingChildren(
-            self.agents, output, api, config.pod_timeout, on_begin=self._warn_anew
+            self.agents,
+            output,
+            api,
+            config.pod_timeout,
+            on_begin=self._warn_anew,
+            on_unreached=self._use_relay,
         )
+        self._may_use_relay = config.relay != "never"
+        self._attached: AttachedPool | None = None
+        self._tunnel: RelayTunnel | None = None
         self.over = False
         """True once the pool has failed or ended, and was deleted or detached from."""
         self._goes_on = False
@@ -179,6 +193,8 @@ class Pods:
         if self._prepared is not None:
             listener = self._prepared.listener
             self._wait_for(lambda then: listener.close("the master ended", then=then))
+        if self._tunnel is not None:
+            self._tunnel.close()
 
     def _wait_for(self, ask: Callable[[Callable[[], None]], None]) -> None:
         """Call ``ask`` with a callback, and wait for the callback, unless the loop is broken."""
@@ -361,12 +377,65 @@ class Pods:
         """Return how many agents are linked; any thread may ask."""
         return len(self._placement.loads)
 
-    def on_attached(self) -> None:
+    def on_attached(self, pool: AttachedPool) -> None:
         """Note that the pool exists, with this program as its master."""
+        self._attached = pool
         route = AgentRoute("")
         if (prepared := self._prepared) is not None:
             route = AgentRoute(prepared.address, prepared.attachment.displaced)
         self._waiting.on_attached(route)
+        if pool.relay:
+            self._open_tunnel(pool)
+
+    # -- Relay
+
+    def _use_relay(self) -> bool:
+        """Ask for a relay, if this program may have one; return whether it did."""
+        pool, client = self._attached, self._client
+        if not self._may_use_relay or self._tunnel is not None or pool is None or client is None:
+            return False
+        self._output.write(
+            "fiber",
+            f"pods do not reach this program at {self._waiting.route.address}, so Fiber starts a "
+            "relay in the cluster and reaches it through the API server. Set relay='always' "
+            "(FIBER_RELAY=always) to begin with it",
+        )
+        client.ask_for_relay(pool)
+        self._open_tunnel(pool)
+        return True
+
+    def _open_tunnel(self, pool: AttachedPool) -> None:
+        if self._prepared is None or self._closing.is_set():
+            return
+        listener = self._prepared.listener
+        listener.be_patient(RELAY_LOST_AFTER)
+        self._tunnel = RelayTunnel(
+            self._api,
+            RelayedPool(pool.name, pool.namespace, pool.uid, pool.master.identity, pool.epoch),
+            take=listener.take,
+            on_trouble=partial(self._loop.call_soon, self._on_relay_trouble),
+            on_refused=partial(self._loop.call_soon, self._on_relay_refused),
+        )
+        self._tunnel.start()
+        self._waiting.use_relay(names.relay_name(pool.name))
+
+    def _on_relay_trouble(self, trouble: str) -> None:
+        if not self._closing.is_set():
+            self._waiting.on_relay_trouble(trouble)
+
+    def _on_relay_refused(self, error: ApiError) -> None:
+        if self._attached is None or self._closing.is_set():
+            return
+        pool = PoolName(self._attached.name, self._attached.namespace)
+        self._waiting.refuse(
+            pool.error(
+                f"this program may not open a port-forward to the relay of its pods: "
+                f"{error.message}. Give its account the role fiber-user, which has the rights get "
+                "and create for pods/portforward, or set relay='never' (FIBER_RELAY=never) and "
+                "run the program where pods reach it",
+                "Forbidden",
+            )
+        )
 
     def on_lease_expired(self) -> None:
         """Make the agents dial the pool's Service again, which leads to its present master."""
@@ -399,6 +468,8 @@ class Pods:
 
     def _end(self) -> None:
         self.over = True
+        if self._tunnel is not None:
+            self._tunnel.begin_close()
         for agent in list(self.agents.agents.values()):
             agent.lose(_NOT_OURS)
         if self._successor is not None and self._goes_on:

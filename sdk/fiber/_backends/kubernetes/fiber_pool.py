@@ -83,7 +83,7 @@ class PoolObserver(Protocol):
     def connected(self) -> int:
         """Return how many agents are linked; called on any thread."""
 
-    def on_attached(self) -> None:
+    def on_attached(self, pool: AttachedPool) -> None:
         """Note that the pool exists, with this program as its master.  Called once."""
 
     def on_status(self, status: Body) -> None:
@@ -153,6 +153,12 @@ class FiberPoolClient:
         Only the newest ``replicas`` counts.  A name to release is kept until its pod is gone.
         """
         self._scaling.want(replicas, release)
+        self._wake.set()
+
+    def ask_for_relay(self, pool: AttachedPool) -> None:
+        """Ask the operator for a relay, to which agents connect instead of this program."""
+        pool.relay = True
+        self._scaling.write_again()
         self._wake.set()
 
     def begin_close(self, timeout: float = CLOSE_TIMEOUT) -> None:
@@ -239,7 +245,7 @@ class FiberPoolClient:
             on_fault=self._reporter.fault,
         )
         self._followers = [renewer, pool, pods]
-        self._loop.call_soon(self._observer.on_attached)
+        self._loop.call_soon(self._observer.on_attached, attached)
         for follower in self._followers:
             follower.start()
         return attached
@@ -491,6 +497,11 @@ class Scaling:
         with self._lock:
             self._replicas = replicas
             self._release.update((name, None) for name in release if name not in self._gone)
+            self._changed = True
+
+    def write_again(self) -> None:
+        """Write the demand again, since another field of the pool has changed."""
+        with self._lock:
             self._changed = True
 
     def gone(self, name: str) -> bool:

@@ -60,10 +60,19 @@ class AgentRoute(NamedTuple):
     """``host:port`` that the pool's Service leads to."""
     displaced: str = ""
     """Identity of the lost master that this program took the pool from."""
+    relay: str = ""
+    """Name of the relay's Deployment, if agents connect to a relay."""
 
     @property
     def advice(self) -> str:
         """Reasons why agents do not arrive, and remedies."""
+        if self.relay:
+            return (
+                "Pods cannot connect to the relay, or the relay has ended: see `kubectl logs "
+                f"deployment/{self.relay}`, and allow connections of the pool's pods to port "
+                f"{names.MASTER_PORT} of the pods with the label {names.LABEL_RELAY} if a "
+                "NetworkPolicy is in between"
+            )
         others = (
             f". Or the pods still serve {self.displaced}, the master before, which does not renew "
             "its Lease: end that program"
@@ -72,10 +81,10 @@ class AgentRoute(NamedTuple):
         )
         return (
             "Pods cannot connect to that address: it is behind NAT, or a firewall or a "
-            "NetworkPolicy is in between. Run the program in a pod of the cluster, or set "
-            "listen_host (FIBER_LISTEN_HOST) to an address of this machine that pods reach, or "
-            "advertised_host (FIBER_ADVERTISED_HOST) to one that is forwarded to it, or "
-            f"allow the connection{others}"
+            "NetworkPolicy is in between. Set relay='auto' (FIBER_RELAY=auto), run the program in "
+            "a pod of the cluster, or set listen_host (FIBER_LISTEN_HOST) to an address of this "
+            "machine that pods reach, or advertised_host (FIBER_ADVERTISED_HOST) to one that is "
+            f"forwarded to it, or allow the connection{others}"
         )
 
 

@@ -219,7 +219,8 @@ class PoolProvisioner:
         port = int(listener.address.rpartition(":")[2])
         # The suffix tells this program from an earlier one with the same pid.
         identity = f"{socket.gethostname()}:{os.getpid()}:{self._suffix}"
-        return PoolMaster(host, port, identity, self._certificate.hash.hex())
+        relay = self._config.relay == "always"
+        return PoolMaster(host, port, identity, self._certificate.hash.hex(), relay=relay)
 
     def _find_own_pod(self, cancel: threading.Event) -> Body | None:
         """Return the pod that this program runs in; None outside of pods."""

@@ -40,6 +40,8 @@ class WaitingChildren:
     """Children of one FiberPool that have no agent yet.  Runs on the loop thread.
 
     ``on_begin`` is called when children begin to wait while the pool has no agent.
+    ``on_unreached`` is called when running pods seem not to reach this program.  It returns True if
+    it has found another way for them.
     """
 
     def __init__(
@@ -50,6 +52,7 @@ class WaitingChildren:
         timeout: float,
         *,
         on_begin: Callable[[], None],
+        on_unreached: Callable[[], bool],
     ) -> None:
         self.pool = PoolName("", "")
         """Pool that the children wait for; without a name before ``on_named``."""
@@ -66,6 +69,9 @@ class WaitingChildren:
         self._timeout = timeout
         self._on_begin = on_begin
         self._timeout_timer: ScheduledCall | None = None
+        self._on_unreached = on_unreached
+        self._relay_trouble: str | None = None
+        """Reason why there is no tunnel to the relay; None if no relay is used or it works."""
         self._reachability = ReachabilityProbe()
         self._verdict = Reachability.OPEN
         self._verdict_reported = False
@@ -101,6 +107,22 @@ class WaitingChildren:
         error = failure(self.pool, status, len(self._placement.loads))
         if error is not None:
             self.refuse(error)
+        self._judge_reachability()
+
+    def use_relay(self, relay: str) -> None:
+        """Note that agents connect to a relay from now on."""
+        self.route = self.route._replace(address=f"the relay {relay}", relay=relay)
+        self._relay_trouble = "it is being made"
+        self._judge_anew()
+
+    def on_relay_trouble(self, trouble: str) -> None:
+        """Take the reason why there is no tunnel to the relay; empty if there is one."""
+        self._relay_trouble = trouble or None
+        if not trouble:
+            self._judge_anew()
+
+    def _judge_anew(self) -> None:
+        self._reachability = ReachabilityProbe()
         self._judge_reachability()
 
     def reached(self) -> None:
@@ -169,7 +191,11 @@ class WaitingChildren:
     def _judge_reachability(self) -> None:
         loop = self._agents.loop
         self._cancel_judgement()
-        self._verdict = self._reachability.judge(running(self.status), now := loop.now())
+        # While there is no tunnel, the pods are not to blame.
+        pods = running(self.status) if self._relay_trouble is None else 0
+        self._verdict = self._reachability.judge(pods, now := loop.now())
+        if self._verdict is not Reachability.OPEN and self._on_unreached():
+            return
         if self._verdict is Reachability.OPEN:
             self._verdict_reported = False
         if self._reachability.due < math.inf:
@@ -216,6 +242,8 @@ class WaitingChildren:
 
     def _describe(self) -> str:
         state = summary(self.status, time.time()) if self.attached else self._api_state()
+        if self._relay_trouble is not None:
+            return f"waiting for pods: {state}; waiting for the relay: {self._relay_trouble}"
         unreached = self._verdict is not Reachability.OPEN
         where = f", no agent has reached {self.route.address}" if unreached else ""
         return f"waiting for pods: {state}{where}"
