@@ -277,8 +277,8 @@ class FiberPoolSpec(Model):
     changed."""
     master: MasterSpec | None = None
     relay: bool = False
-    """True: the workers connect to a relay, a small pod of this pool, to which the master connects
-    through the API server. For masters that pods cannot reach. Written by the SDK."""
+    """True: the workers connect to a relay pod, which the master reaches through the API server.
+    Written by the SDK."""
     on_lost: Literal["Delete", "ScaleToMin", "Retain"] = "ScaleToMin"
     """Action when the master is lost: Delete deletes the pool with all its objects, ScaleToMin goes
     back to minReplicas, Retain changes nothing."""

@@ -219,9 +219,8 @@ class Config:
         A range such as "9000-9009" takes the first free one: for several programs on one host.
     advertised_host*: the address that pods dial if it is not the one above, as behind NAT or
         port forwarding. The port is the same. None means the address above.
-    relay*: whether agents connect to a relay, a small pod in the cluster that the program reaches
-        through the API server. "auto": if no agent of a running pod reaches the program within
-        seconds. "always": without that attempt. "never": not at all.
+    relay*: whether pods connect to a relay, a pod that the program reaches through the API server:
+        "always", "never", or "auto", which means if no pod reaches the program within seconds.
     start_timeout: seconds that a process or an agent may take to start.
     heartbeat_interval*: seconds between two heartbeats of an agent.
     suspect_after*: seconds of silence after which an agent gets no new work.
@@ -317,14 +316,10 @@ if TYPE_CHECKING:
 # ---- the configuration in force -------------------------------------------------------------
 
 
-def _not_in_use() -> bool:
-    return False
-
-
 # One configuration, or none yet.  No lock: if a signal handler makes a pipe while its thread reads
 # the sources, it would wait for itself.  If several threads read the sources, the first one counts.
 _current: dict[str, Config] = {}
-_in_use: Callable[[], bool] = _not_in_use
+_in_use: Callable[[], bool] = bool  # returns False until there is a runtime
 _used = False  # True once an object outside of the runtime, such as a pipe, depends on it
 
 

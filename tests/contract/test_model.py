@@ -38,6 +38,7 @@ FULL_SPEC: dict[str, Any] = {
     "maxReplicas": 2,
     "minAvailable": 1,
     "suspend": False,
+    "relay": True,
     "processesPerPod": 1,
     "template": {
         "metadata": {},

@@ -25,7 +25,7 @@ from patience import PATIENCE
 def _bare_process(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """No configuration in force, none in the environment, none above the directory."""
     monkeypatch.setattr(config, "_current", {})
-    monkeypatch.setattr(config, "_in_use", config._not_in_use)
+    monkeypatch.setattr(config, "_in_use", bool)
     monkeypatch.setattr(config, "_used", False)
     for name in [name for name in os.environ if name.startswith("FIBER_")]:
         monkeypatch.delenv(name)

@@ -361,7 +361,7 @@ def test_only_a_waiting_process_prints_why_one_more_pod_is_missing(
     def begin() -> None:
         pods.on_pod("es-1-a", RUNNING)
         pods.on_agent(Dialled("es-1-a"))  # type: ignore[arg-type]
-        pods.on_attached()
+        pods.on_attached(SimpleNamespace(relay=False))  # type: ignore[arg-type]
         pods.on_status({**status, "problems": [full]})
 
     site.loop.call_soon(begin)

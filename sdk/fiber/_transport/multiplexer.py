@@ -115,7 +115,7 @@ def send(sock: socket.socket, data: memoryview) -> int:
 
 
 class _Stream:
-    """One stream and its socket."""
+    """Stream with its socket."""
 
     __slots__ = (
         "credit",
@@ -152,7 +152,7 @@ class _Stream:
 
 
 class Multiplexer:
-    """One end of a connection that streams share.  Runs on the thread of ``loop``.
+    """End of a connection that streams share.  Runs on the thread of ``loop``.
 
     ``on_open`` gets the address of an agent and returns the socket for its stream.  ``on_hello``
     gets a HELLO frame.  ``on_end`` is called once, with the reason, when the connection is broken

@@ -60,7 +60,7 @@ class Kind(enum.IntEnum):
 
 
 class StreamFrame(NamedTuple):
-    """One frame."""
+    """Frame on the connection."""
 
     kind: Kind
     stream: int = 0

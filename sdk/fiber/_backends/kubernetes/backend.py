@@ -152,9 +152,8 @@ class Pods:
             api,
             config.pod_timeout,
             on_begin=self._warn_anew,
-            on_unreached=self._use_relay,
+            on_unreached=None if config.relay == "never" else self._use_relay,
         )
-        self._may_use_relay = config.relay != "never"
         self._attached: AttachedPool | None = None
         self._tunnel: RelayTunnel | None = None
         self.over = False
@@ -389,11 +388,11 @@ class Pods:
 
     # -- Relay
 
-    def _use_relay(self) -> bool:
-        """Ask for a relay, if this program may have one; return whether it did."""
+    def _use_relay(self) -> None:
+        """Ask for a relay."""
         pool, client = self._attached, self._client
-        if not self._may_use_relay or self._tunnel is not None or pool is None or client is None:
-            return False
+        if pool is None or client is None or self._closing.is_set():
+            return
         self._output.write(
             "fiber",
             f"pods do not reach this program at {self._waiting.route.address}, so Fiber starts a "
@@ -402,10 +401,9 @@ class Pods:
         )
         client.ask_for_relay(pool)
         self._open_tunnel(pool)
-        return True
 
     def _open_tunnel(self, pool: AttachedPool) -> None:
-        if self._prepared is None or self._closing.is_set():
+        if self._prepared is None or self._closing.is_set() or self._tunnel is not None:
             return
         listener = self._prepared.listener
         listener.be_patient(RELAY_LOST_AFTER)

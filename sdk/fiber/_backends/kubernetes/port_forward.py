@@ -89,7 +89,7 @@ class PortForward:
         self._sock.setblocking(False)
         self._frames = websocket.frame_buffer(self._receive, skip_utf8_validation=True)
         self._begun = [False, False]
-        """Whether the first message of each channel has come."""
+        """Flags of the channels: True once the first message has come."""
         self.backlog = 0
         self._kept: deque[memoryview] = deque()
 

@@ -40,8 +40,8 @@ class WaitingChildren:
     """Children of one FiberPool that have no agent yet.  Runs on the loop thread.
 
     ``on_begin`` is called when children begin to wait while the pool has no agent.
-    ``on_unreached`` is called when running pods seem not to reach this program.  It returns True if
-    it has found another way for them.
+    ``on_unreached``, if there is another way for agents, is called once when those of running pods
+    seem not to reach this program.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class WaitingChildren:
         timeout: float,
         *,
         on_begin: Callable[[], None],
-        on_unreached: Callable[[], bool],
+        on_unreached: Callable[[], None] | None = None,
     ) -> None:
         self.pool = PoolName("", "")
         """Pool that the children wait for; without a name before ``on_named``."""
@@ -72,7 +72,9 @@ class WaitingChildren:
         self._on_unreached = on_unreached
         self._relay_trouble: str | None = None
         """Reason why there is no tunnel to the relay; None if no relay is used or it works."""
-        self._reachability = ReachabilityProbe()
+        self._reachability = ReachabilityProbe(
+            DOUBTED_AFTER if on_unreached is None else RELAYED_AFTER
+        )
         self._verdict = Reachability.OPEN
         self._verdict_reported = False
         self._next_judgement: ScheduledCall | None = None
@@ -111,6 +113,7 @@ class WaitingChildren:
 
     def use_relay(self, relay: str) -> None:
         """Note that agents connect to a relay from now on."""
+        self._on_unreached = None
         self.route = self.route._replace(address=f"the relay {relay}", relay=relay)
         self._relay_trouble = "it is being made"
         self._judge_anew()
@@ -194,7 +197,10 @@ class WaitingChildren:
         # While there is no tunnel, the pods are not to blame.
         pods = running(self.status) if self._relay_trouble is None else 0
         self._verdict = self._reachability.judge(pods, now := loop.now())
-        if self._verdict is not Reachability.OPEN and self._on_unreached():
+        if self._verdict is not Reachability.OPEN and self._on_unreached is not None:
+            use_another_way, self._on_unreached = self._on_unreached, None
+            self._judge_anew()
+            use_another_way()
             return
         if self._verdict is Reachability.OPEN:
             self._verdict_reported = False
@@ -321,6 +327,9 @@ DOUBTED_AFTER = 8.0
 """Seconds from the first running pod until the missing agent is reported.  An agent needs a second
 or two to start and to dial."""
 
+RELAYED_AFTER = 4.0
+"""Seconds from the first running pod until a relay is asked for, if no agent has dialed."""
+
 GIVEN_UP_AFTER = 60.0
 """Seconds from that report to the error."""
 
@@ -340,7 +349,8 @@ class Reachability(enum.Enum):
 class ReachabilityProbe:
     """Record of the running pods of one FiberPool, and of the first agent that dialed."""
 
-    def __init__(self) -> None:
+    def __init__(self, doubted_after: float = DOUBTED_AFTER) -> None:
+        self._doubted_after = doubted_after
         self.due = math.inf
         """Time of the next judgement that can differ from the last."""
         self._proven = False
@@ -364,8 +374,8 @@ class ReachabilityProbe:
         if running > self._running or late:
             self._newest = now  # the agent of a new pod gets as much time as the first
         self._running = running
-        doubted_at = self._since + DOUBTED_AFTER
-        given_up_at = max(doubted_at + GIVEN_UP_AFTER, self._newest + DOUBTED_AFTER)
+        doubted_at = self._since + self._doubted_after
+        given_up_at = max(doubted_at + GIVEN_UP_AFTER, self._newest + self._doubted_after)
         if now >= given_up_at:
             return Reachability.UNREACHABLE
         self.due = given_up_at if now >= doubted_at else doubted_at
