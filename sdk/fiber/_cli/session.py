@@ -1,0 +1,58 @@
+"""Connection of a command to the cluster, and the options that choose cluster and namespace."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
+
+import click
+
+from fiber import config
+from fiber._backends.kubernetes.api import Api
+from fiber._cli.failures import explained
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+class Session(NamedTuple):
+    """Connection to one namespace of a cluster."""
+
+    api: Api
+    namespace: str
+
+    @property
+    def where(self) -> str:
+        """Namespace and cluster, for messages."""
+        return f"the namespace {self.namespace!r} of the cluster at {self.api.server}"
+
+
+def connect(context: str | None, namespace: str | None) -> Session:
+    """Connect as a program with this configuration would.  No call is made."""
+    with explained("connect to a cluster"):
+        settings = config.load()
+        api = Api.connect(context or settings.context)
+        return Session(api, namespace or settings.namespace or api.namespace)
+
+
+def cluster_options(command: F) -> F:
+    """Add ``--namespace`` and ``--context`` to a command."""
+    command = click.option(
+        "--context", metavar="NAME", help="Context of the kubeconfig.  Default: the current one."
+    )(command)
+    return click.option(
+        "-n",
+        "--namespace",
+        metavar="NAME",
+        help="Namespace.  Default: that of pyproject.toml, FIBER_NAMESPACE, or the context.",
+    )(command)
+
+
+def output_option(command: F) -> F:
+    """Add ``--output`` to a command that lists."""
+    return click.option(
+        "-o",
+        "--output",
+        type=click.Choice(["table", "json"]),
+        default="table",
+        help="Form of the output.",
+    )(command)
