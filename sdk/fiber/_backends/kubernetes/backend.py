@@ -82,6 +82,7 @@ class KubernetesBackend:
         make = partial(
             Pods, self._loop, self._hub, self._output, self._config, self._provisioner.api
         )
+        make = partial(make, on_unreached=self._provisioner.use_relay)
         if isinstance(key, str):
             return make(partial(self._provisioner.prepare_warm, key, self._loop))
         prepare = partial(self._provisioner.prepare_own, key, self._loop)
@@ -116,6 +117,8 @@ Document = Mapping[str, Any]
 class Pods:
     """Pods of one FiberPool, which begins with the first child and scales with the children.
 
+    ``on_unreached`` is called if pods do not reach this program, which then uses a relay.
+
     ``prepare`` returns the pool, and begins to listen for its agents.  It blocks until the event
     that it gets is set, and raises FiberError.  ``successor`` returns the agents of the next pool,
     if another one can follow.  Any thread may call ``agents.child`` and ``close``.  All else runs
@@ -131,8 +134,10 @@ class Pods:
         api: Api,
         prepare: Callable[[ListenerObserver, threading.Event], PreparedPool],
         successor: Callable[[], AgentSet] | None = None,
+        on_unreached: Callable[[], None] = lambda: None,
     ) -> None:
         self._loop = loop
+        self._note_unreached = on_unreached
         self._output = output
         self._api = api
         self._prepare = prepare
@@ -399,6 +404,7 @@ class Pods:
             "relay in the cluster and reaches it through the API server. Set relay='always' "
             "(FIBER_RELAY=always) to begin with it",
         )
+        self._note_unreached()
         client.ask_for_relay(pool)
         self._open_tunnel(pool)
 

@@ -107,9 +107,15 @@ class PoolProvisioner:
         self._suffix = secrets.token_hex(_SUFFIX_BYTES)
         self._numbers = itertools.count()
         self._certificate = make_certificate()
+        self._relayed = config.relay == "always"
+        """True if agents are to connect to a relay, without another attempt."""
         self._acceptors: dict[str, Acceptor] = {}
         """Acceptors by the host that they listen at: one, unless this machine's address changes.
         All pools share them until the program ends."""
+
+    def use_relay(self) -> None:
+        """Have the next pools begin with a relay, since pods do not reach this program."""
+        self._relayed = True
 
     def close(self) -> None:
         """Close the acceptors and the connections to the API server."""
@@ -208,19 +214,27 @@ class PoolProvisioner:
     def _addresses(self, pool: str) -> tuple[str, str]:
         """Return the address to listen at and the one that pods dial."""
         listen, advertised = self._config.listen_host, self._config.advertised_host
+        if self._relayed:
+            return _LOOPBACK, _NOWHERE
         if advertised is not None:
             advertised = resolved("advertised_host", advertised)
             if listen is not None:
                 return listen, advertised
-        found = reachable_address(self._api, listen, pool=pool, namespace=self.namespace)
+        try:
+            found = reachable_address(self._api, listen, pool=pool, namespace=self.namespace)
+        except FiberPoolError:
+            if self._config.relay == "never":
+                raise
+            self._relayed = True
+            return _LOOPBACK, _NOWHERE
         return listen or found, advertised or found
 
     def _master(self, host: str, listener: MasterListener) -> PoolMaster:
         port = int(listener.address.rpartition(":")[2])
         # The suffix tells this program from an earlier one with the same pid.
         identity = f"{socket.gethostname()}:{os.getpid()}:{self._suffix}"
-        relay = self._config.relay == "always"
-        return PoolMaster(host, port, identity, self._certificate.hash.hex(), relay=relay)
+        certificate = self._certificate.hash.hex()
+        return PoolMaster(host, port, identity, certificate, relay=self._relayed)
 
     def _find_own_pod(self, cancel: threading.Event) -> Body | None:
         """Return the pod that this program runs in; None outside of pods."""
@@ -294,6 +308,11 @@ def _mountinfo() -> str:
 
 _NODES = 10
 """Number of nodes to look at: the route to one is mostly the route to all."""
+
+_LOOPBACK = "127.0.0.1"
+_NOWHERE = "192.0.2.1"
+"""Address in ``spec.master`` of a program that only its relay reaches: it belongs to no machine
+(RFC 5737)."""
 
 _ELSEWHERE = ("192.0.2.1", "2001:db8::1")
 """Unused addresses (RFC 5737, RFC 3849), to which the default route leads."""
