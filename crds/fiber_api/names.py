@@ -137,6 +137,18 @@ ENV_RELAY_AGENTS_PORT: Final = "FIBER_RELAY_AGENTS_PORT"
 """Port for agents. A worker's command that has this variable is a relay."""
 ENV_RELAY_MASTER_PORT: Final = "FIBER_RELAY_MASTER_PORT"
 
+# -- Programs that `fiber run` starts
+
+LABEL_PROGRAM: Final = f"{GROUP}/program"
+"""Label of the Job and the pod of a program, with the program's name."""
+ANNOTATION_COMMAND: Final = f"{GROUP}/command"
+"""Annotation of the Job: the program's command line, for people."""
+PROGRAM_CONTAINER: Final = "program"
+PROGRAM_ACCOUNT: Final = "fiber-program"
+"""ServiceAccount of programs, unless `fiber run` is given another one."""
+LAUNCHER_PORT: Final = 7072
+"""Port on the loopback of the program's pod, to which `fiber run` opens a port-forward."""
+
 # -- The Secret: its keys
 
 KEY_POOL: Final = "key"

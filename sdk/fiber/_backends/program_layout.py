@@ -69,6 +69,21 @@ class Layout(NamedTuple):
     paths: ProgramPaths
 
 
+class ProgramFile(NamedTuple):
+    """Main module of a program."""
+
+    file: str | None
+    """Absolute path; None if it is installed or has no file."""
+    folder: str
+    """Folder of the program: that of the script or, for ``-m``, in which the package was found."""
+
+    @classmethod
+    def of_this_process(cls) -> ProgramFile:
+        """Return the main module of this process."""
+        file = main_file()
+        return cls(file, "" if file is None else _folder_of(file))
+
+
 class _ImportedModule(NamedTuple):
     """Module that has been imported."""
 
@@ -79,17 +94,24 @@ class _ImportedModule(NamedTuple):
     """Name of the place, so that the module can be imported from it."""
 
 
-def find_layout(preparation: Mapping[str, Any], left_out: frozenset[str]) -> Layout:
-    """Return the layout of this program, whose children are prepared by ``preparation``.
+def find_layout(
+    preparation: Mapping[str, Any], left_out: frozenset[str], program: ProgramFile | None = None
+) -> Layout:
+    """Return the layout of a program, whose children are prepared by ``preparation``.
 
-    Of the folders ``left_out`` only imported modules are sent.
+    Without ``program`` it is this one.  Of the folders ``left_out`` only imported modules are sent.
     """
-    main, here = main_file(), os.path.abspath(preparation["dir"])
-    program = here if main is None else _folder_of(main)
+    main, folder = program or ProgramFile.of_this_process()
+    here = os.path.abspath(preparation["dir"])
+    program_folder = here if main is None else folder
     # Other main modules are imported by their names, or not at all (a package's __main__).
     by_path = "init_main_from_path" in preparation
     path = list(map(os.path.abspath, preparation["sys_path"]))
-    whole = (folder for folder in (program, *path) if folder == program or _is_offered(folder))
+    whole = (
+        folder
+        for folder in (program_folder, *path)
+        if folder == program_folder or _is_offered(folder)
+    )
     places = Places(_named(_outermost(f for f in whole if _is_sent(f) and f not in left_out)))
     modules = sorted(_imported(left_out))
     if main is not None:
@@ -98,14 +120,14 @@ def find_layout(preparation: Mapping[str, Any], left_out: frozenset[str]) -> Lay
     places.update({module.whole: f"{LOOSE}/{module.name}" for module in loose})
     return Layout(
         places,
-        program,
+        program_folder,
         tuple(module.file for module in modules),
         tuple(dict.fromkeys(tree for tree in path if _is_tree(tree, places))),
         _session(here).intersection(places) if main is None else frozenset(),
         ProgramPaths(
             *_search_path(places, path),
-            directory=(_is_inside(here, program) and places.name_of(here))
-            or places.name_of(program)
+            directory=(_is_inside(here, program_folder) and places.name_of(here))
+            or places.name_of(program_folder)
             or LOOSE,
             main=None if main is None or not by_path else places.name_of(main),
         ),

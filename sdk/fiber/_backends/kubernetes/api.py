@@ -48,6 +48,9 @@ _PAUSE_MIN, _PAUSE_MAX = 0.1, 5.0
 _WATCH_SECONDS = 60.0
 """Seconds after which the API server ends a watch; a silence of twice that ends it too."""
 
+_SILENCE = 24 * 3600.0
+"""Seconds that a log may be silent."""
+
 _AS_SDK: Mapping[str, str] = {"fieldManager": names.SDK_MANAGER}
 
 
@@ -146,6 +149,10 @@ class Api:
         }
         return Watch(self._session, ApiRequest("GET", path, query))
 
+    def log(self, pod: str, query: Mapping[str, str]) -> PodLog:
+        """Read the log of the pod at the path ``pod``.  ``query``: options of the API server."""
+        return PodLog(self._session, ApiRequest("GET", f"{pod}/log", query))
+
     def port_forward(self, pod: str, port: int) -> PortForward:
         """Connect to a port on the loopback of the pod at the path ``pod``."""
         query = {"ports": str(port)}
@@ -178,6 +185,34 @@ class Api:
                 if delay > deadline - time.monotonic() or wait(delay):
                     raise
             pause = min(2 * pause, _PAUSE_MAX)
+
+
+class PodLog:
+    """Log of one container, in pieces of bytes, until its end or ``stop``."""
+
+    def __init__(self, session: ApiSession, request: ApiRequest) -> None:
+        self._session = session
+        self._request = request
+        self._response: BaseHTTPResponse | None = None
+
+    def __iter__(self) -> Iterator[bytes]:
+        """Yield the pieces; ``ApiError``."""
+        # A program may print nothing for a long time.
+        response = self._session.send(self._request, _SILENCE)
+        self._response = response
+        try:
+            if response.status != 200:
+                _document(response)
+            with network_errors():
+                yield from response.stream(None, decode_content=True)
+        finally:
+            response.close()
+
+    def stop(self) -> None:
+        """End the reading, also while it waits.  Any thread."""
+        if (response := self._response) is not None:
+            with contextlib.suppress(OSError, ValueError, RuntimeError):  # it has just ended
+                response.shutdown()
 
 
 class Watch:

@@ -175,14 +175,14 @@ class RelayTunnel:
             if (pod.get("status") or {}).get("phase") == "Running":
                 return str(pod["metadata"]["name"])
         if present:
-            raise NoRelay(f"its pod {present[0]['metadata']['name']} {_state_of(present[0])}")
+            raise NoRelay(f"its pod {present[0]['metadata']['name']} {state_of(present[0])}")
         name = names.relay_name(self._pool.name)
         raise NoRelay(
             f"it has no pod yet (`kubectl describe deployment {name} -n {self._pool.namespace}`)"
         )
 
 
-def _state_of(pod: Mapping[str, Any]) -> str:
+def state_of(pod: Mapping[str, Any]) -> str:
     """Return why a pod does not run, in words that the pod's name precedes."""
     status = pod.get("status") or {}
     for container in status.get("containerStatuses") or ():
