@@ -189,7 +189,7 @@ _SUBMODULES = frozenset(
     }
 )
 
-_OTHER_FILES = frozenset({"agent", "joblib"})
+_OTHER_FILES = frozenset({"agent", "joblib", "launcher"})
 
 _HOMES = {
     "AdoptionError": "errors",

@@ -36,13 +36,14 @@ import signal
 import struct
 import subprocess
 import sys
-import tarfile
+import tempfile
 import threading
 from collections import deque
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from io import BufferedIOBase
 from typing import IO, Any
+
+from fiber._agent.zygote import unpack
 
 FAILED = 125
 STDOUT, STDERR, DROPPED, EXIT = 1, 2, 3, 4
@@ -129,16 +130,15 @@ class Launcher:
         self.started = threading.Event()
         """Set once the program runs, or cannot be started."""
 
-    def start(self, archive: BufferedIOBase, layout: dict[str, Any]) -> None:
-        """Unpack the archive and start the program; OSError if it cannot be started.
+    def start(self, archive: IO[bytes], layout: dict[str, Any]) -> None:
+        """Unpack the archive and start the program.
 
         A repeated call does nothing: the answer to the first may have been lost.
         """
         with self._lock:
             if self._process is not None:
                 return
-            with tarfile.open(fileobj=archive, mode="r|gz") as files:
-                files.extractall(self._folder, filter="data")
+            unpack(archive.fileno(), self._folder)
             self._process = self._popen(layout)
             for kind, pipe in ((STDOUT, self._process.stdout), (STDERR, self._process.stderr)):
                 copy = threading.Thread(target=self._copy, args=(kind, pipe), daemon=True)
@@ -195,9 +195,11 @@ def _handler(launcher: Launcher) -> type[BaseHTTPRequestHandler]:
         def do_PUT(self) -> None:
             layout = json.loads(self.headers.get("Fiber-Layout") or "{}")
             try:
-                launcher.start(self.rfile, layout)
-            except (OSError, tarfile.TarError) as error:
-                self.send_error(500, f"the program cannot be started: {error}")
+                with tempfile.TemporaryFile() as archive:
+                    self._receive(archive)
+                    launcher.start(archive, layout)
+            except Exception as error:  # `fiber run` reports it
+                self.send_error(500, " ".join(str(error).split()) or type(error).__name__)
             else:
                 self._answer()
 
@@ -210,6 +212,16 @@ def _handler(launcher: Launcher) -> type[BaseHTTPRequestHandler]:
             for record in launcher.output.read(int(self.path.rpartition("/")[2])):
                 self.wfile.write(record)
             launcher.output.was_read()
+
+        def _receive(self, file: IO[bytes]) -> None:
+            left = int(self.headers["Content-Length"])
+            while left:
+                piece = self.rfile.read(min(left, _PIECE))
+                if not piece:
+                    raise ConnectionResetError("the connection broke")
+                file.write(piece)
+                left -= len(piece)
+            file.seek(0)
 
         def _answer(self) -> None:
             self.send_response(200)
