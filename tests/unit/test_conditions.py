@@ -16,6 +16,7 @@ from fiber import synchronize
 from fiber._hub import hosted, shared_blocks
 from fiber._hub.client import HubStream
 from fiber._hub.protocol import Op
+from fiber._sync.wait_list import WaitList
 from hosts import Far, Hosts, background
 from patience import PATIENCE
 
@@ -24,7 +25,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork:Deprecati
 
 
 @pytest.fixture
-def hosts() -> Iterator[Hosts]:
+def hosts(all_caught: None) -> Iterator[Hosts]:
     hosts = Hosts()
     hosts.link("b", "a")
     with hosts.at("b"):
@@ -211,6 +212,29 @@ def test_a_remote_notify_wakes_without_the_doorbell(
         condition.notify()
     thread.join(PATIENCE)
     assert woken == ["far"]
+
+
+def test_a_notify_rings_the_doorbell_only_for_a_waiter_elsewhere(
+    hosts: Hosts, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(hosted, "_LOOK", 2 * PATIENCE)  # the hub does not look by itself
+    condition = fiber.Condition()
+    woken: list[str] = []
+    rings: list[list[str]] = []
+
+    def ring() -> None:
+        rings.append(list(woken))
+        hosts["a"].doorbell.ring()
+
+    assert isinstance(condition._waiters, WaitList)
+    condition._waiters._ring = ring
+    for name, there in (("near", condition), ("far", Far(hosts)(condition))):
+        thread = waiter(there, woken, name)
+        with condition:
+            condition.notify()
+        thread.join(PATIENCE)
+    assert woken == ["near", "far"]
+    assert rings == [["near"]]
 
 
 def test_ctrl_c_in_a_wait_leaves_no_waiter(

@@ -14,9 +14,10 @@ import pytest
 
 from faults.program import wait_for
 from fiber._transport import authentication, dialer
-from fiber._transport.authentication import AgentHello, Identity
+from fiber._transport.authentication import AgentHello, Identity, MasterWelcome
 from fiber._transport.credentials import Credentials, make_credentials
 from fiber._transport.link import Keepalive
+from fiber._transport.loop import Loop
 from fiber.errors import AuthenticationError, ConfigError, LinkError, VersionMismatch
 from patience import PATIENCE
 from unit.link_site import Site, black_hole, free_port, port_of, say, vanish
@@ -58,6 +59,19 @@ def test_the_dialer_gives_up_without_a_listener(site: Site) -> None:
     assert f"no master answered at {address} within 0.3 s: connection refused" in str(
         agent.errors[0]
     )
+
+
+def test_a_link_outlives_the_time_to_find_a_master(site: Site) -> None:
+    listener, master = site.listener()
+    _, agent = site.dialer(listener.address, timeout=PATIENCE)
+    assert agent.link is not master.link
+    site.loop.now = lambda: Loop.now() + PATIENCE  # type: ignore[method-assign]  # of this loop alone
+    for _ in range(2):  # in the second turn the loop has called what was due
+        site.on_loop(lambda: None)
+    agent.link.send(b"late")
+    master.wait_for_frames(1)
+    assert not agent.events
+    assert not agent.errors
 
 
 def test_a_malformed_name_is_given_up_in_time_and_named(site: Site) -> None:
@@ -309,6 +323,35 @@ def test_a_client_that_is_no_agent_is_refused(site: Site) -> None:
         say(listener.address, site.credentials.agent("a", "uid"), b"GET / HTTP/1.1")
     master.wait(lambda: master.refusals)
     assert "no agent of Fiber" in master.refusals[0]
+
+
+def test_an_agent_that_dials_again_gets_no_more_by_its_old_connection(site: Site) -> None:
+    listener, master = site.listener()
+    _, agent = site.dialer(listener.address)
+    assert agent.link is not master.link
+    hello = AgentHello(master.link.peer, next(iter(listener._links)), 0, True)
+    greetings: list[bytes] = []
+
+    class Pending:
+        def welcome(self, greeting: bytes, then: object) -> None:
+            assert not master.link.is_connected, "what still comes is not in the greeting"
+            greetings.append(greeting)
+
+    pending: Any = Pending()
+    site.on_loop(lambda: listener._welcome(pending, hello))
+    assert len(greetings) == 1
+
+
+@pytest.mark.parametrize("answer", [b"HTTP/1.1 400 Bad Request", bytes(1 << 20)])
+def test_a_peer_that_does_not_answer_as_a_master_is_named(
+    site: Site, monkeypatch: pytest.MonkeyPatch, answer: bytes
+) -> None:
+    monkeypatch.setattr(MasterWelcome, "encode", lambda _: answer)
+    listener, _ = site.listener()
+    _, agent = site.dialer(listener.address)
+    agent.wait(lambda: agent.errors)
+    assert isinstance(agent.errors[0], LinkError)
+    assert str(agent.errors[0]).startswith(f"the peer at {listener.address} is no master: its ")
 
 
 def test_a_greeting_carries_only_identity_and_place() -> None:
