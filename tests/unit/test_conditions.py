@@ -15,6 +15,7 @@ from census import wait_until
 from fiber import synchronize
 from fiber._hub import hosted, shared_blocks
 from fiber._hub.client import HubStream
+from fiber._hub.local import LocalCounter
 from fiber._hub.protocol import Op
 from fiber._sync.wait_list import WaitList
 from hosts import Far, Hosts, background
@@ -80,6 +81,15 @@ def fork_that(action: Callable[[], object]) -> int:
 def kill(pid: int) -> None:
     os.kill(pid, 9)
     os.waitpid(pid, 0)
+
+
+def test_the_things_of_dead_processes_go_to_the_counter() -> None:
+    waiters, counter = shared_blocks.create_wait_list(), LocalCounter.create()
+    os.waitpid(fork_that(lambda: waiters.hold(waiters.enter(), 3)), 0)
+    waiters.hold(waiters.enter(), 2)
+    assert waiters.held() == 5
+    assert [waiters.reclaim(counter), counter.value(), waiters.held()] == [3, 3, 2]
+    assert [waiters.reclaim(counter), counter.value()] == [0, 3]
 
 
 # Conditions

@@ -261,6 +261,17 @@ def test_an_agent_that_comes_before_its_pod_is_known_waits_for_it(site: Site) ->
     assert agent.link is not master.link
 
 
+def test_an_agent_that_waits_and_dials_again_waits_once(site: Site) -> None:
+    listener, master = site.listener()
+    listener._knows = lambda _: None
+    identity = Identity.of_this_process("agent-1", "uid")
+    for count in (1, 2):
+        site.dialer(listener.address, identity=identity)
+        master.wait(lambda: len(master.proofs) >= count)  # noqa: B023 - it is called at once
+    wait_for(lambda: len(listener._acceptor._pending) == 1)
+    assert len(site.on_loop(lambda: list(listener._waiting))) == 1
+
+
 def test_an_agent_with_the_name_of_another_pod_gets_the_reason(site: Site) -> None:
     listener, master = site.listener()
     listener._knows = lambda identity: f"{identity.uid!r} is no pod"
