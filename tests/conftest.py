@@ -6,6 +6,7 @@ import gc
 import os
 import shutil
 import signal
+import sys
 import tempfile
 import uuid
 from collections.abc import Iterator
@@ -74,6 +75,19 @@ def pipe() -> Iterator[tuple[Connection, Connection]]:
         yield one, other
 
 
+@pytest.fixture
+def all_caught(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """After the test: no loop or other thread of Fiber has reported an exception.
+
+    They go on after it, so the test might not notice.
+    """
+    uncaught: list[BaseException] = []
+    monkeypatch.setattr(sys, "excepthook", lambda _kind, error, _trace: uncaught.append(error))
+    yield
+    for error in uncaught:
+        raise error
+
+
 def _running_loop() -> Iterator[Loop]:
     from fiber._transport.loop import Loop
 
@@ -88,7 +102,7 @@ module_loop = pytest.fixture(_running_loop, scope="module", name="module_loop")
 
 
 @pytest.fixture
-def hosts() -> Iterator[Hosts]:
+def hosts(all_caught: None) -> Iterator[Hosts]:
     from hosts import Hosts
 
     hosts = Hosts()

@@ -64,6 +64,44 @@ def test_a_pair_makes_each_socket_once(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(made) == 2
 
 
+def test_a_receiver_sleeps_in_the_kernel_until_a_message_comes(
+    ends: Ends, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    receiver, sender = ends
+    waits = []
+    receive = packet.receive
+
+    def receive_what_comes(*args: Any, wait: bool, **options: Any) -> packet.Message:
+        waits.append(wait)
+        if len(waits) > 1:
+            sender.send(b"1")
+        return receive(*args, wait=wait, **options)
+
+    monkeypatch.setattr(packet, "receive", receive_what_comes)
+    assert receiver.try_recv() is None
+    assert receiver.recv().tobytes() == b"1"
+    assert waits == [False, True]
+
+
+def test_a_poll_sleeps_as_long_as_it_may(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
+    receiver, _ = ends
+    naps: list[float] = []
+
+    def readable_in_the_end(_: int, timeout: float) -> bool:
+        naps.append(timeout)
+        return len(naps) == 3
+
+    monkeypatch.setattr(local, "wait_readable", readable_in_the_end)
+    for timeout in (None, 10 * local.LOOK_AGAIN):
+        naps.clear()
+        assert receiver.poll(timeout)
+        assert naps == [local.LOOK_AGAIN] * 3
+    for timeout in (0, -1):
+        naps.clear()
+        assert not receiver.poll(timeout)
+        assert naps == [0]
+
+
 def overflow(sender: SendingEnd, count: int = MORE_THAN_A_SOCKET) -> None:
     for number in range(count):
         assert sender.try_send(b"%d" % number)

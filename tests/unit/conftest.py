@@ -23,7 +23,7 @@ def credentials() -> OwnCredentials:
 
 
 @pytest.fixture
-def site(credentials: OwnCredentials) -> Iterator[Site]:
+def site(credentials: OwnCredentials, all_caught: None) -> Iterator[Site]:
     from unit.link_site import Site  # it starts nng, which is for the tests of links alone
 
     site = Site(credentials)

@@ -130,6 +130,26 @@ def test_a_greeting_without_end_is_turned_away(site: Site) -> None:
     assert "its greeting is longer than 65536 bytes" in master.refusals[0]
 
 
+def test_a_rejected_client_has_time_to_read_the_reason_until_it_leaves(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(acceptor, "_LAST_WORD", 2 * PATIENCE)
+    listener, master = site.listener()
+    accepting = listener._acceptor
+    visitor = Visitor(site, listener.address)
+    visitor.go("TLS proved")
+    visitor.handshake.sock.send(bytes(32) + b"\xff\xff\xff\xff")
+    master.wait(lambda: master.refusals)
+    os.write(visitor.handshake.sock.fileno(), b"it has more to say")
+    for _ in range(2):  # in the second turn the loop has read that
+        turned = threading.Event()
+        accepting.loop.call_soon(turned.set)
+        assert turned.wait(PATIENCE)
+    assert accepting._pending
+    visitor.rest()
+    wait_for(lambda: not accepting._pending)
+
+
 def test_a_false_proof_is_reported_with_the_claimed_name(site: Site) -> None:
     listener, master = site.listener()
     forged = site.credentials.agent("another", "")

@@ -15,7 +15,9 @@ from census import wait_until
 from fiber import synchronize
 from fiber._hub import hosted, shared_blocks
 from fiber._hub.client import HubStream
+from fiber._hub.local import LocalCounter
 from fiber._hub.protocol import Op
+from fiber._sync.wait_list import WaitList
 from hosts import Far, Hosts, background
 from patience import PATIENCE
 
@@ -24,7 +26,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork:Deprecati
 
 
 @pytest.fixture
-def hosts() -> Iterator[Hosts]:
+def hosts(all_caught: None) -> Iterator[Hosts]:
     hosts = Hosts()
     hosts.link("b", "a")
     with hosts.at("b"):
@@ -79,6 +81,15 @@ def fork_that(action: Callable[[], object]) -> int:
 def kill(pid: int) -> None:
     os.kill(pid, 9)
     os.waitpid(pid, 0)
+
+
+def test_the_things_of_dead_processes_go_to_the_counter() -> None:
+    waiters, counter = shared_blocks.create_wait_list(), LocalCounter.create()
+    os.waitpid(fork_that(lambda: waiters.hold(waiters.enter(), 3)), 0)
+    waiters.hold(waiters.enter(), 2)
+    assert waiters.held() == 5
+    assert [waiters.reclaim(counter), counter.value(), waiters.held()] == [3, 3, 2]
+    assert [waiters.reclaim(counter), counter.value()] == [0, 3]
 
 
 # Conditions
@@ -211,6 +222,29 @@ def test_a_remote_notify_wakes_without_the_doorbell(
         condition.notify()
     thread.join(PATIENCE)
     assert woken == ["far"]
+
+
+def test_a_notify_rings_the_doorbell_only_for_a_waiter_elsewhere(
+    hosts: Hosts, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(hosted, "_LOOK", 2 * PATIENCE)  # the hub does not look by itself
+    condition = fiber.Condition()
+    woken: list[str] = []
+    rings: list[list[str]] = []
+
+    def ring() -> None:
+        rings.append(list(woken))
+        hosts["a"].doorbell.ring()
+
+    assert isinstance(condition._waiters, WaitList)
+    condition._waiters._ring = ring
+    for name, there in (("near", condition), ("far", Far(hosts)(condition))):
+        thread = waiter(there, woken, name)
+        with condition:
+            condition.notify()
+        thread.join(PATIENCE)
+    assert woken == ["near", "far"]
+    assert rings == [["near"]]
 
 
 def test_ctrl_c_in_a_wait_leaves_no_waiter(

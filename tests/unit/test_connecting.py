@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import socket
-from collections.abc import Iterator
+from typing import NoReturn
 
 import pytest
 
-from fiber._transport.credentials import make_credentials
+from fiber._transport import dialer
 from fiber._transport.dialer import connect
 from unit.link_site import Site, black_hole, free_port, port_of
 
@@ -24,13 +26,6 @@ def has_ipv6() -> bool:
 
 
 pytestmark = pytest.mark.skipif(not has_ipv6(), reason="this machine has no ::1")
-
-
-@pytest.fixture
-def site() -> Iterator[Site]:
-    made = Site(make_credentials())
-    yield made
-    made.end()
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
@@ -59,6 +54,21 @@ def test_an_address_without_an_answer_times_out() -> None:
 def test_where_all_refuse_the_error_says_so() -> None:
     with pytest.raises(ConnectionRefusedError):
         connect([("127.0.0.1", free_port()), ("::1", free_port())], PATIENCE)
+
+
+def test_where_no_attempt_can_begin_the_first_error_says_so(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    codes = [errno.EMFILE, errno.ENETUNREACH]
+
+    def begin(_: object) -> NoReturn:
+        code = codes.pop()
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(dialer, "_begin", begin)
+    with pytest.raises(OSError, match=os.strerror(errno.ENETUNREACH)):
+        connect([("127.0.0.1", 1), ("::1", 1)], PATIENCE)
+    assert not codes
 
 
 def test_an_agent_reaches_its_master_at_one_of_two_addresses(site: Site) -> None:

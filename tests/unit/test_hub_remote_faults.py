@@ -6,6 +6,7 @@ Host ``a`` has the objects; this process is on host ``b``.
 from __future__ import annotations
 
 import multiprocessing
+import os
 import pickle
 import signal
 import threading
@@ -16,6 +17,7 @@ import pytest
 
 import fiber
 from census import wait_until
+from fiber._hub import client
 from fiber._hub.client import ObjectUnreachable
 from fiber._hub.local import LocalCounter
 from fiber.connection import Connection
@@ -167,6 +169,16 @@ def test_a_process_forked_by_multiprocessing_has_separate_streams(
         here.send("to the parent")
         assert remote.recv() == "to the parent"
         remote.close()
+
+
+@pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork:DeprecationWarning")
+def test_a_fork_of_the_hubs_process_reaches_the_hub_from_outside(hosts: Hosts) -> None:
+    with hosts.at("a") as hub:
+        address = hub.address
+        pid = os.fork()
+        if not pid:
+            os._exit(0 if (client._local_hub, client._address) == (None, address) else 1)
+    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
 
 
 def test_a_queue_whose_host_is_gone_blocks_no_caller(hosts: Hosts, far: Far) -> None:

@@ -14,9 +14,10 @@ import pytest
 
 from faults.program import wait_for
 from fiber._transport import authentication, dialer
-from fiber._transport.authentication import AgentHello, Identity
+from fiber._transport.authentication import AgentHello, Identity, MasterWelcome
 from fiber._transport.credentials import Credentials, make_credentials
 from fiber._transport.link import Keepalive
+from fiber._transport.loop import Loop
 from fiber.errors import AuthenticationError, ConfigError, LinkError, VersionMismatch
 from patience import PATIENCE
 from unit.link_site import Site, black_hole, free_port, port_of, say, vanish
@@ -58,6 +59,19 @@ def test_the_dialer_gives_up_without_a_listener(site: Site) -> None:
     assert f"no master answered at {address} within 0.3 s: connection refused" in str(
         agent.errors[0]
     )
+
+
+def test_a_link_outlives_the_time_to_find_a_master(site: Site) -> None:
+    listener, master = site.listener()
+    _, agent = site.dialer(listener.address, timeout=PATIENCE)
+    assert agent.link is not master.link
+    site.loop.now = lambda: Loop.now() + PATIENCE  # type: ignore[method-assign]  # of this loop alone
+    for _ in range(2):  # in the second turn the loop has called what was due
+        site.on_loop(lambda: None)
+    agent.link.send(b"late")
+    master.wait_for_frames(1)
+    assert not agent.events
+    assert not agent.errors
 
 
 def test_a_malformed_name_is_given_up_in_time_and_named(site: Site) -> None:
@@ -247,6 +261,17 @@ def test_an_agent_that_comes_before_its_pod_is_known_waits_for_it(site: Site) ->
     assert agent.link is not master.link
 
 
+def test_an_agent_that_waits_and_dials_again_waits_once(site: Site) -> None:
+    listener, master = site.listener()
+    listener._knows = lambda _: None
+    identity = Identity.of_this_process("agent-1", "uid")
+    for count in (1, 2):
+        site.dialer(listener.address, identity=identity)
+        master.wait(lambda: len(master.proofs) >= count)  # noqa: B023 - it is called at once
+    wait_for(lambda: len(listener._acceptor._pending) == 1)
+    assert len(site.on_loop(lambda: list(listener._waiting))) == 1
+
+
 def test_an_agent_with_the_name_of_another_pod_gets_the_reason(site: Site) -> None:
     listener, master = site.listener()
     listener._knows = lambda identity: f"{identity.uid!r} is no pod"
@@ -309,6 +334,35 @@ def test_a_client_that_is_no_agent_is_refused(site: Site) -> None:
         say(listener.address, site.credentials.agent("a", "uid"), b"GET / HTTP/1.1")
     master.wait(lambda: master.refusals)
     assert "no agent of Fiber" in master.refusals[0]
+
+
+def test_an_agent_that_dials_again_gets_no_more_by_its_old_connection(site: Site) -> None:
+    listener, master = site.listener()
+    _, agent = site.dialer(listener.address)
+    assert agent.link is not master.link
+    hello = AgentHello(master.link.peer, next(iter(listener._links)), 0, True)
+    greetings: list[bytes] = []
+
+    class Pending:
+        def welcome(self, greeting: bytes, then: object) -> None:
+            assert not master.link.is_connected, "what still comes is not in the greeting"
+            greetings.append(greeting)
+
+    pending: Any = Pending()
+    site.on_loop(lambda: listener._welcome(pending, hello))
+    assert len(greetings) == 1
+
+
+@pytest.mark.parametrize("answer", [b"HTTP/1.1 400 Bad Request", bytes(1 << 20)])
+def test_a_peer_that_does_not_answer_as_a_master_is_named(
+    site: Site, monkeypatch: pytest.MonkeyPatch, answer: bytes
+) -> None:
+    monkeypatch.setattr(MasterWelcome, "encode", lambda _: answer)
+    listener, _ = site.listener()
+    _, agent = site.dialer(listener.address)
+    agent.wait(lambda: agent.errors)
+    assert isinstance(agent.errors[0], LinkError)
+    assert str(agent.errors[0]).startswith(f"the peer at {listener.address} is no master: its ")
 
 
 def test_a_greeting_carries_only_identity_and_place() -> None:

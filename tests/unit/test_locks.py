@@ -9,12 +9,14 @@ import pickle
 import threading
 import warnings
 from collections.abc import Callable, Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 import fiber
 from fiber._hub import shared_blocks
+from fiber._sync import liveness
 from fiber._sync import semaphore as module
 from fiber._sync.semaphore import COUNTING, RECURSIVE, SEM_VALUE_MAX, SharedSemaphore
 from fiber.synchronize import Abandoned
@@ -106,6 +108,57 @@ def test_a_try_does_not_wait_for_the_mutex_of_a_revival(one: SharedSemaphore) ->
     holder.join(PATIENCE)
     assert tried == [False, True]
     assert one.try_acquire()
+
+
+def test_who_finds_the_mutex_taken_gets_it_afterwards(
+    one: SharedSemaphore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entered, found_taken = threading.Event(), threading.Event()
+    steps: list[str] = []
+
+    def hold_mutex() -> None:
+        entered.set()
+        found_taken.wait(PATIENCE)
+        steps.append("first")
+
+    def sleep(_: float) -> None:
+        assert not steps, "it does not try again"
+        found_taken.set()
+        holder.join(PATIENCE)
+
+    monkeypatch.setattr(liveness, "time", SimpleNamespace(sleep=sleep))
+    holder = threading.Thread(target=lambda: one._mutex.run(hold_mutex))
+    holder.start()
+    entered.wait(PATIENCE)
+    one._mutex.run(lambda: steps.append("second"))
+    assert steps == ["first", "second"]
+
+
+def test_a_waiter_sleeps_in_the_kernel(one: SharedSemaphore) -> None:
+    assert elsewhere(one.acquire)
+    waits: list[bool] = []
+    take = one._take
+
+    def taking(block: bool, timeout: float | None) -> object:
+        waits.append(block)
+        return take(block, timeout)
+
+    one._take = taking
+    assert not one.acquire(False)
+    assert waits == [False]
+    assert not one.acquire(timeout=0.01)
+    assert waits[:3] == [False, False, True]
+
+
+def test_each_release_rings_while_the_hub_listens() -> None:
+    semaphore = shared_blocks.create_semaphore(COUNTING, 1, SEM_VALUE_MAX)
+    rings: list[None] = []
+    semaphore._ring = lambda: rings.append(None)
+    for listens, count in ((False, 0), (True, 2), (False, 2)):
+        semaphore.listen(listens)
+        take_turn(semaphore)
+        semaphore.release()  # what this process has not acquired
+        assert len(rings) == count
 
 
 @pytest.mark.parametrize("make", [fiber.Lock, fiber.RLock, fiber.Condition])

@@ -14,7 +14,7 @@ import pytest
 
 import fiber
 from census import wait_until
-from fiber._hub import shared_blocks
+from fiber._hub import hosted, shared_blocks
 from fiber._hub.client import HubStream, ObjectUnreachable
 from fiber._hub.protocol import Op, Status
 from fiber._hub.shared_blocks import RemoteSemaphore
@@ -31,7 +31,7 @@ MAKERS = {
 
 
 @pytest.fixture
-def hosts() -> Iterator[Hosts]:
+def hosts(all_caught: None) -> Iterator[Hosts]:
     """Locks are made on host a; this process is on host b."""
     hosts = Hosts()
     hosts.link("b", "a")
@@ -85,6 +85,20 @@ def test_a_waiter_elsewhere_gets_the_lock(here: Any, far: Far) -> None:
         waiter.join(PATIENCE)
     assert got == [True, True]
     assert here.acquire(timeout=PATIENCE)
+
+
+def test_a_release_rings_the_doorbell_for_a_waiter_elsewhere(
+    here: Any, far: Far, hosts: Hosts, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(hosted, "SLICE", 2 * PATIENCE)  # the hub does not look by itself
+    there = far(here)
+    assert here.acquire()
+    waiter = background(lambda: (there.acquire(), there.release()))
+    assert wait_until(lambda: bool(hosts["a"].doorbell._listeners), PATIENCE)
+    with hosts.at("a"):
+        here.release()
+    waiter.join(PATIENCE)
+    assert not waiter.is_alive()
 
 
 def test_an_rlock_of_another_host_is_its_threads(far: Far) -> None:

@@ -68,7 +68,10 @@ class Network:
         self.ends[side].send(frame)
 
     def speak(self, side: int) -> None:
-        for datagram in outgoing(self.ends[side], self.now):
+        wanted = self.ends[side].wants_to_speak(self.now)
+        datagrams = outgoing(self.ends[side], self.now)
+        assert wanted == bool(datagrams)
+        for datagram in datagrams:
             if self.rng.random() < self.drop:
                 continue
             self.flying[side].append(datagram)
@@ -329,6 +332,7 @@ def test_frames_wait_while_disconnected_and_leave_afterwards() -> None:
     one.disconnected()
     other.disconnected()
     one.send(b"queued")
+    assert not one.wants_to_speak(50)
     assert outgoing(one, 50) == []
     one.connected(other.arrived)
     other.connected(one.arrived)

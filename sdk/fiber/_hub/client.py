@@ -173,11 +173,6 @@ class Reply:
         self.parts = message.buffers
         self.fds, message.fds = message.fds, []
 
-    def close_descriptors(self) -> None:
-        """Close the descriptors of a reply that is not used."""
-        for fd in self.fds:
-            os.close(fd)
-
 
 class HubStream:
     """Stream to the hub ``home``.  Opening one does not wait for the hub."""
@@ -307,7 +302,6 @@ class HubStream:
             reply = self.receive()
             if reply.number == number:
                 return reply
-            reply.close_descriptors()
 
     def _comes_by(self, deadline: float) -> bool:
         return wait_readable(self._sock.fileno(), deadline - time.monotonic())
