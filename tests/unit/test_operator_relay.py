@@ -176,7 +176,8 @@ def test_a_relay_has_no_secret_no_account_and_no_variable_of_the_template() -> N
 
 def test_a_relay_of_privileged_workers_has_no_privilege() -> None:
     own = {"privileged": True, "procMount": "Unmasked", "capabilities": {"add": ["SYS_ADMIN"]}}
-    wide = {"sysctls": [{"name": "net.core.somaxconn", "value": "1"}]}
+    unconfined = {"type": "Unconfined"}
+    wide = {"sysctls": [{"name": "a", "value": "1"}], "seccompProfile": unconfined}
     spec = spec_of({"securityContext": wide}, securityContext=own)
     assert spec["securityContext"] == RESTRICTED_POD
     assert spec["containers"][0]["securityContext"] == RESTRICTED

@@ -33,7 +33,6 @@ _OF_THE_POD = (
 """Fields of the template's pod that decide where a pod may run."""
 
 _OF_THE_SECURITY_CONTEXT = (
-    "appArmorProfile",
     "fsGroup",
     "fsGroupChangePolicy",
     "readOnlyRootFilesystem",
@@ -41,7 +40,6 @@ _OF_THE_SECURITY_CONTEXT = (
     "runAsNonRoot",
     "runAsUser",
     "seLinuxOptions",
-    "seccompProfile",
     "supplementalGroups",
 )
 """Fields of a security context that say as which user a container runs.  The others give rights
