@@ -25,7 +25,7 @@ PASSED_ON = {
     "nodes with any taint of one effect",
     "the control plane",
 }
-"""What the relay has, too, because it says where and as whom a pod may run."""
+"""Cases that the relay shares, because they say where and as whom a pod may run."""
 ALICE = "alice"
 LAB = "system:serviceaccount:lab:"
 

@@ -16,7 +16,21 @@ Json = dict[str, Any]
 
 RESTRICTED_POD = {"runAsNonRoot": True, "seccompProfile": {"type": "RuntimeDefault"}}
 RESTRICTED = {"allowPrivilegeEscalation": False, "capabilities": {"drop": ["ALL"]}}
-GARBAGE = (None, True, -1, 0.5, "", "x", [], {}, [None], [[]], [{}], {"name": {}}, [{"name": []}])
+GARBAGE: tuple[Any, ...] = (
+    None,
+    True,
+    -1,
+    0.5,
+    "",
+    "x",
+    [],
+    {},
+    [None],
+    [[]],
+    [{}],
+    {"name": {}},
+    [{"name": []}],
+)
 
 
 def template(pod: Json | None = None, /, **worker: Any) -> Json:
@@ -215,7 +229,7 @@ def test_a_relay_runs_where_the_workers_may_run() -> None:
     }
     required = {"nodeSelectorTerms": [{"matchExpressions": [{"key": "a", "operator": "Exists"}]}]}
     nodes = {"requiredDuringSchedulingIgnoredDuringExecution": required}
-    pods = {"preferredDuringSchedulingIgnoredDuringExecution": []}
+    pods: Json = {"preferredDuringSchedulingIgnoredDuringExecution": []}
     spec = spec_of({**where, "affinity": {"nodeAffinity": nodes, "podAntiAffinity": pods}})
     assert where.items() <= spec.items()
     assert spec["affinity"] == {"nodeAffinity": nodes}
@@ -229,7 +243,7 @@ def test_a_relay_leaves_a_lost_node_soon_whatever_the_template_tolerates() -> No
     for toleration in (first, second):
         assert toleration["effect"] == "NoExecute"
         assert toleration["tolerationSeconds"] < podspec.NODE_LOST_SECONDS
-    taints = [names_["key"].partition("/")[2] for names_ in (first, second)]
+    taints = [toleration["key"].partition("/")[2] for toleration in (first, second)]
     assert taints == ["not-ready", "unreachable"]
 
 
@@ -290,7 +304,7 @@ OLD, NEW = template(image="registry/worker:1"), template(image="registry/worker:
 
 
 def may_stay(there: Json, wanted: Json, proven: Json | None, **spec: Any) -> bool:
-    """Whether the relay of one template stays when the pool has another one."""
+    """Return True if the relay of one template stays when the pool has another one."""
     existing = relay.deployment(make_pool(relay=True, template=there))
     existing["spec"].update(spec)
     status = {} if proven is None else {"provenTemplateHash": hash_of(proven)}
