@@ -23,6 +23,22 @@ def may_use_pools(scene: Scene) -> None:
     scene.kube.create(scene.path("rolebindings"), binding)
 
 
+def may_not(scene: Scene, resource: str) -> None:
+    """Take the rights to a resource from the namespace's account."""
+    group = "rbac.authorization.k8s.io"
+    role = scene.kube.call("GET", f"/apis/{group}/v1/clusterroles/fiber-user")
+    rules = [rule for rule in role["rules"] if resource not in rule["resources"]]
+    scene.kube.create(scene.path("roles"), {"metadata": {"name": ACCOUNT}, "rules": rules})
+    binding = scene.kube.call("GET", scene.path("rolebindings", ACCOUNT))
+    scene.kube.delete(scene.path("rolebindings", ACCOUNT))
+    other = {
+        "metadata": {"name": f"{ACCOUNT}-with-less"},
+        "roleRef": {"apiGroup": group, "kind": "Role", "name": ACCOUNT},
+        "subjects": binding["subjects"],
+    }
+    scene.kube.create(scene.path("rolebindings"), other)
+
+
 def make_account(scene: Scene, name: str) -> None:
     """An account without rights."""
     scene.kube.create(scene.path("serviceaccounts"), {"metadata": {"name": name}})

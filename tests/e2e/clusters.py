@@ -30,12 +30,14 @@ from cluster import (
     fake_nodes,
     faults,
     images,
+    laptop,
     lifecycle,
     places,
 )
 from cluster.ability import Choice
 from cluster.filters import Allowed
 from cluster.images import Image
+from cluster.laptop import Laptop
 from cluster.shell import ClusterError, output, wait_for
 
 NODES = 2
@@ -105,6 +107,10 @@ class Cluster:
         """Have one more image on the nodes, of those that few tests need; its reference."""
         raise NotImplementedError
 
+    def laptop(self) -> AbstractContextManager[Laptop]:
+        """Have a machine that reaches the API server, and that no pod reaches."""
+        self._skip("put a laptop behind NAT")
+
     def fake_nodes(self, count: int) -> None:
         """Have this many nodes that only pretend to run pods."""
         self._skip(f"add {count} pretended nodes")
@@ -162,6 +168,9 @@ class Own(Cluster):
 
     def bring(self, image: Image) -> str:
         return images.bring(image)
+
+    def laptop(self) -> AbstractContextManager[Laptop]:
+        return laptop.plugged_in()
 
     def fake_nodes(self, count: int) -> None:
         fake_nodes.set_count(count)

@@ -18,6 +18,7 @@ from typing import Any
 
 import pytest
 
+from cluster.laptop import Laptop
 from e2e.accounts import ACCOUNT, kubeconfig_of
 from e2e.clusters import Cluster
 from e2e.kube import Body, Stream
@@ -107,14 +108,19 @@ class Outside(Program):
     """Process beside the tests, in a separate process group."""
 
     def __init__(
-        self, scene: Scene, script: Path, arguments: Sequence[str], environment: dict[str, str]
+        self,
+        scene: Scene,
+        script: Path,
+        arguments: Sequence[str],
+        environment: dict[str, str],
+        prefix: Sequence[str] = (),
     ) -> None:
         super().__init__(scene)
         self._status: int | None = None
         # A private folder, because a killed program leaves its temporary files.
         self._temporary = tempfile.TemporaryDirectory(prefix="program-")
         self._process = subprocess.Popen(
-            [sys.executable, str(script), *arguments],
+            [*prefix, sys.executable, str(script), *arguments],
             env={**environment, "PYTHONUNBUFFERED": "1", "TMPDIR": self._temporary.name},
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
@@ -279,6 +285,8 @@ class Programs:
         """PersistentVolumeClaims that programs started inside from now on mount."""
         self.image: str | None = None
         """Image of later programs inside; None: one of the project's."""
+        self.laptop: Laptop | None = None
+        """Laptop of the programs that ``on_laptop`` starts."""
         self._started: list[Program] = []
 
     def start(self, place: str, script: str, *arguments: object, **settings: object) -> Program:
@@ -300,6 +308,11 @@ class Programs:
         assert isinstance(program, Outside)
         return program
 
+    def on_laptop(self, script: str, *arguments: object, **settings: object) -> Outside:
+        """Start it on the laptop."""
+        assert self.laptop is not None
+        return self.outside(script, *arguments, **settings)
+
     def close(self) -> None:
         for program in self._started:
             program.close()
@@ -309,6 +322,7 @@ class Programs:
     ) -> Outside:
         if self._cluster.outside is None:
             pytest.skip(f"{self._cluster.description}: pods cannot reach a program outside of it")
+        prefix = () if self.laptop is None else self.laptop.command
         all_settings = {
             "backend": "kubernetes",
             "namespace": self.scene.namespace,
@@ -316,7 +330,8 @@ class Programs:
             **settings,
         }
         environment = {**_without_fiber(), "KUBECONFIG": str(self.kubeconfig)}
-        return Outside(self.scene, script, words, {**environment, **_variables(all_settings)})
+        environment |= _variables(all_settings)
+        return Outside(self.scene, script, words, environment, prefix)
 
     def _inside(
         self, script: Path, words: list[str], image: str, settings: dict[str, object]

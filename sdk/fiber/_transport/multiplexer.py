@@ -31,7 +31,7 @@ _SPARE = 64 << 20
 _FULL = 256 << 10
 """Bytes that the carrier has left to send, above which no socket is read."""
 
-_PING_AFTER, _DEAD_AFTER = 5.0, 20.0
+_PING_AFTER, _DEAD_AFTER = 3.0, 12.0
 """Seconds of silence until a PING, and until the connection counts as dead."""
 
 
