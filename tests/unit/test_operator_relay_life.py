@@ -134,6 +134,7 @@ async def test_a_new_master_behind_the_relay_changes_the_slice_alone(world: Worl
     await world.until(lambda: world.status().get("masterEpoch") == 2)
     assert led_to(world) == []
     assert {plural for _, plural in calls(world)} <= {"endpointslices"}
+    assert world.api.count("get", "deployments") == 0
     told = "Workers dial the master at 10.0.3.7:2, epoch 2 through a relay"
     await world.until(lambda: told in [e["message"] for e in world.store.list("events")])
 
@@ -360,6 +361,18 @@ async def test_a_relay_of_unknown_state_is_checked_again(world: World) -> None:
     failing.times = 0
     await world.until(lambda: leads_to_the_master(world), within=60)
     await world.until(lambda: len(events(world)) == 2)
+
+
+@played
+async def test_a_relay_that_may_not_be_read_is_not_taken_for_removed(world: World) -> None:
+    await a_relayed_pool(world)
+    without = Fault("get", "deployments", status=403, reason="Forbidden", times=10**6)
+    world.api.faults.append(without)
+    world.edit(relay=False)
+    await world.until(lambda: world.reasons() == ["Forbidden"])
+    assert world.status()["relay"] == RELAY
+    without.times = 0
+    await world.until(lambda: leads_to_the_master(world), within=60)
 
 
 @played
