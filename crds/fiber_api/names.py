@@ -28,7 +28,7 @@ CRD_NAME: Final = f"{PLURAL}.{GROUP}"
 SDK_MANAGER: Final = "fiber-sdk"
 """Owner of ``spec.replicas``, ``spec.scaleDown.release``, ``spec.master`` and ``spec.relay``."""
 OPERATOR_MANAGER: Final = "fiber-operator"
-"""Owner of the status, the pods, the Service, its EndpointSlice and the Secret, unless
+"""Owner of the status, the pods, the Service, its EndpointSlice, the relay and the Secret, unless
 ``spec.credentialsSecretName`` names one; never of the spec."""
 
 # -- Labels and annotations
@@ -126,7 +126,8 @@ ENDPOINT_SCHEME: Final = "tls+tcp"
 # -- The relay, for programs that pods cannot reach
 
 LABEL_RELAY: Final = f"{GROUP}/relay"
-"""Label of the relay's pod, with the uid of its pool. The Service selects the pod by it."""
+"""Label of the relay's pod, with the uid of its pool. The Service selects the pod by it. The pod
+has neither LABEL_POOL nor LABEL_POOL_UID, by which workers are found."""
 ANNOTATION_RELAY_HASH: Final = f"{GROUP}/relay-hash"
 """Annotation of the relay's Deployment: hash of the body that the operator wrote."""
 RELAY_CONTAINER: Final = "relay"

@@ -114,7 +114,7 @@ class FiberPoolStatus(Model):
     master: str | None = None
     """Address of the master that the endpoint leads to now."""
     relay: str | None = None
-    """Name of the relay's Deployment, to which the endpoint leads."""
+    """Name of the Deployment of the pool's relay."""
     master_epoch: Annotated[int | None, Field(ge=0, le=2**53)] = None
     """Highest epoch that a master of this pool has had. A new master takes a higher one."""
     master_signature: str | None = None

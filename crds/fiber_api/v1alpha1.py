@@ -263,21 +263,20 @@ class FiberPoolSpec(Model):
     max_replicas: Annotated[int, Field(ge=1, le=100_000)] = 1000
     """Most workers, also if replicas is higher."""
     min_available: Annotated[int, Field(ge=1, le=100_000)] | None = None
-    """Workers that a drain of nodes leaves ready, at least: the operator makes a
-    PodDisruptionBudget. Left out, there is none."""
+    """Workers that a drain of nodes leaves ready, at least, by a PodDisruptionBudget."""
     suspend: bool = False
     """True: delete all pods and keep the resource."""
     processes_per_pod: Annotated[int, Field(ge=1, le=1024)] = 1
     """Processes that each worker's agent runs side by side."""
     template: Template
-    """Pod that a worker runs in, as in a Deployment's template. Its fields win over those that
-    Fiber adds."""
+    """Pod that a worker runs in, as in a Deployment's template. Its fields win over
+    Fiber's."""
     worker_container: Annotated[str, Field(min_length=1, max_length=63)] = names.WORKER_CONTAINER
     """Name of the container that runs Fiber's agent and by which a worker is judged. Cannot be
     changed."""
     master: MasterSpec | None = None
     relay: bool = False
-    """True: the workers connect to a relay pod, which the master reaches through the API server.
+    """True: workers connect to a relay pod, which the master reaches through the API server.
     Written by the SDK."""
     on_lost: Literal["Delete", "ScaleToMin", "Retain"] = "ScaleToMin"
     """Action when the master is lost: Delete deletes the pool with all its objects, ScaleToMin goes

@@ -1,7 +1,8 @@
 """Objects of a pool beside its workers: Service, EndpointSlice, Secret, PodDisruptionBudget, relay.
 
 They are checked when the operator first sees a pool, every ``CHECK_INTERVAL`` seconds, and in each
-reconcile while something is wrong with them.  Between the checks only a new master causes a call.
+reconcile while something is wrong with them.  Between the checks only a new master, another budget
+or the begin or end of a relay causes calls.
 A Secret that ``spec.credentialsSecretName`` names belongs to the user; the operator only makes
 sure that it is not another pool's, and signs with its key.
 """
@@ -130,11 +131,15 @@ class DependentsReconciler:
             (f"the EndpointSlice {names.endpoint_slice_name(name)}", self._slice)
         ]
         fresh = known is not None and self._now() - known.checked < CHECK_INTERVAL
-        complete = known is None or not fresh or bool(known.obstacles)
+        relay_name = names.relay_name(name) if relay.is_wanted(pool) else ""
+        complete = (
+            known is None
+            or not fresh
+            or bool(known.obstacles)
+            or known.relay_name != relay_name  # the Service changes, too
+        )
         if known is not None and not complete:
-            spec = pool.spec
-            there = (known.master, known.budget, known.relay_name)
-            if there == (spec.master, spec.min_available, _wanted_relay(pool)):
+            if (known.master, known.budget) == (pool.spec.master, pool.spec.min_available):
                 return known
             address, secret, checked = known.address, known.secret, known.checked
             whole = known.credentials
@@ -148,7 +153,7 @@ class DependentsReconciler:
         budgeted = _concerns_budget(pool, known)
         if budgeted:
             steps.append((f"the PodDisruptionBudget {names.budget_name(name)}", self._budget))
-        relayed = pool.spec.relay or _may_have_relay(pool, known)
+        relayed = complete and (relay_name or _may_have_relay(pool, known))
         if relayed:
             steps.insert(0, (f"the Deployment {names.relay_name(name)}", self._relay))
         outcomes = await _all(*(self._attempt(pool, *step) for step in steps))
@@ -168,7 +173,7 @@ class DependentsReconciler:
             whole,
             secret,
             0 if budgeted and found[-1].obstacle is not None else pool.spec.min_available,
-            None if relay_found.obstacle is not None else _wanted_relay(pool),
+            None if relay_found.obstacle is not None else relay_name,
             next((step.failure for step in outcomes if step.failure is not None), None),
         )
 
@@ -236,12 +241,14 @@ class DependentsReconciler:
         wanted = manifests.service(pool)
         existing = await self._have_service(pool, name, wanted)
         spec = mapping(existing, "spec")
-        foreign = spec.get("selector") and spec.get("selector") != relay.selector(pool)
-        if foreign or not _has_ports(spec, wanted["spec"]["ports"]):
-            patch = {"spec": {"ports": wanted["spec"]["ports"]}}
-            if foreign:
-                patch["spec"]["selector"] = None
-            await self._cluster.patch(SERVICES, namespace, name, patch)
+        selected = mapping(spec, "selector")
+        patch = manifests.selector_patch(pool, selected)
+        if patch or not _has_ports(spec, wanted["spec"]["ports"]):
+            patch["ports"] = wanted["spec"]["ports"]
+            await self._cluster.patch(SERVICES, namespace, name, {"spec": patch})
+        if selected and not pool.spec.relay and not pool.status.relay:
+            # An operator may have ended between the relay's making and its note in the status.
+            await self._remove(pool, DEPLOYMENTS, names.relay_name(pool.metadata.name))
         host = spec.get("clusterIP")
         if not isinstance(host, str) or host in ("", "None"):
             message = (
@@ -283,25 +290,20 @@ class DependentsReconciler:
             await self._cluster.patch(SLICES, namespace, name, patch)
 
     async def _relay(self, pool: FiberPool) -> None:
-        """Make the relay and have the Service select its pod, or remove the relay.
-
-        The selector stays when the relay goes.  Kubernetes then removes the pod's address from the
-        Service, which it would not do for a Service without a selector.
-        """
+        """Make, replace or remove the relay; ``_service`` leads agents to it."""
         name, namespace = names.relay_name(pool.metadata.name), pool.metadata.namespace
-        if not pool.spec.relay:
+        if not relay.is_wanted(pool):
             await self._remove(pool, DEPLOYMENTS, name)
             return
         wanted = relay.deployment(pool)
-        existing = await self._have(pool, DEPLOYMENTS, name, lambda: wanted)
-        if not relay.is_current(existing, wanted):
-            await self._remove(pool, DEPLOYMENTS, name)
-            await self._cluster.create(DEPLOYMENTS, namespace, wanted)
-        service = names.service_name(pool.metadata.name)
-        found = await self._have(pool, SERVICES, service, lambda: manifests.service(pool))
-        if mapping(found, "spec").get("selector") != relay.selector(pool):
-            patch = {"spec": {"selector": relay.selector(pool)}}
-            await self._cluster.patch(SERVICES, namespace, service, patch)
+        try:
+            existing = await self._have(pool, DEPLOYMENTS, name, lambda: wanted)
+            if not relay.may_stay(pool, existing, wanted):
+                uid = str(mapping(existing, "metadata").get("uid"))
+                await self._cluster.delete(DEPLOYMENTS, namespace, name, uid=uid)
+                await self._cluster.create(DEPLOYMENTS, namespace, wanted)
+        except Invalid as error:
+            raise _Obstructed(messages.refused_relay(error, name)) from None
 
     async def _budget(self, pool: FiberPool) -> None:
         name, namespace = names.budget_name(pool.metadata.name), pool.metadata.namespace
@@ -318,8 +320,12 @@ class DependentsReconciler:
         namespace = pool.metadata.namespace
         try:
             existing = await self._cluster.read(resource, namespace, name)
-        except (NotFound, Forbidden):
-            return  # without the right to read one, the operator has made none
+        except NotFound:
+            return
+        except Forbidden:
+            if resource == BUDGETS:
+                return  # without the right to read one, the operator has made none
+            raise
         if manifests.is_ours(pool, existing):
             uid = str(mapping(existing, "metadata").get("uid"))
             await self._cluster.delete(resource, namespace, name, uid=uid)
@@ -365,10 +371,6 @@ def _signer(pool: FiberPool, secret: Body, remedy: str) -> signatures.Signer | N
         raise _Obstructed(Obstacle(Reason.INVALID_CREDENTIALS, message, True)) from None
 
 
-def _wanted_relay(pool: FiberPool) -> str:
-    return names.relay_name(pool.metadata.name) if pool.spec.relay else ""
-
-
 def _may_have_relay(pool: FiberPool, known: Dependents | None) -> bool:
     return bool(pool.status.relay) if known is None else known.relay_name != ""
 
@@ -404,7 +406,7 @@ def _former_addresses(pool: FiberPool) -> list[str]:
         ]
     except ValueError:
         return []
-    master = pool.spec.master
+    master = None if pool.spec.relay else pool.spec.master
     if master and ipaddress.ip_address(master.host).version not in {one.version for one in found}:
         return []
     return [str(one) for one in found]

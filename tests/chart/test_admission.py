@@ -9,12 +9,23 @@ import pytest
 
 from chart.helm import Helm, Manifest, kinds, named
 from chart.policy_cases import ALLOWED, FORBIDDEN, Body, of_context, of_pod, with_more
+from fiber_operator.planning import relay
+from unit.operator_objects import make_pool
 
 cel: Any = importlib.import_module("cel")  # it has no types
 
 POLICY = "ValidatingAdmissionPolicy"
 CREATED: Body = {"admissionPolicy": {"create": True}}
 TEMPLATE = of_pod(containers=[{"name": "worker", "image": "fiber-worker"}])
+PASSED_ON = {
+    "a priority class of the system",
+    "a type of SELinux",
+    "a user of SELinux",
+    "nodes with any taint",
+    "nodes with any taint of one effect",
+    "the control plane",
+}
+"""Cases that the relay shares, because they say where and as whom a pod may run."""
 ALICE = "alice"
 LAB = "system:serviceaccount:lab:"
 
@@ -54,6 +65,23 @@ def test_a_forbidden_field_is_refused_with_user_reason_and_remedy(
     assert said.startswith(f"the template of {ALICE} asks for ")
     assert words in said
     assert "ask an administrator" in said
+
+
+@pytest.mark.parametrize("case", ALLOWED)
+def test_the_relay_of_an_allowed_template_asks_for_nothing_else(
+    case: str, policy: Manifest
+) -> None:
+    """The policy does not judge Deployments; those of a cluster may be as strict."""
+    pool = make_pool(relay=True, template=with_more(TEMPLATE, ALLOWED[case]))
+    made = relay.deployment(pool)["spec"]["template"]
+    assert refusals(policy, made) == []
+
+
+@pytest.mark.parametrize("case", sorted(set(FORBIDDEN) - PASSED_ON))
+def test_the_relay_asks_for_nothing_that_the_policy_forbids(case: str, policy: Manifest) -> None:
+    pool = make_pool(relay=True, template=with_more(TEMPLATE, FORBIDDEN[case][0]))
+    made = relay.deployment(pool)["spec"]["template"]
+    assert refusals(policy, made) == []
 
 
 @pytest.mark.parametrize("case", ALLOWED)

@@ -45,6 +45,7 @@ def calls() -> list[Call]:
                 grows,
                 loses_workers,
                 keeps_a_budget,
+                uses_a_relay,
                 gets_stuck,
                 meets_masters,
                 is_orphaned,
@@ -95,6 +96,14 @@ async def keeps_a_budget(world: World) -> None:
     await world.until(lambda: bool(counted(world, "delete", "poddisruptionbudgets")))
 
 
+async def uses_a_relay(world: World) -> None:
+    """Ask for a relay, and let the next master come without one."""
+    world.edit(relay=True)
+    await world.until(lambda: bool(counted(world, "create", "deployments")))
+    world.edit(relay=False)
+    await world.until(lambda: bool(counted(world, "delete", "deployments")))
+
+
 async def gets_stuck(world: World) -> None:
     """Request a worker that its node cannot start, as only an event says; then scale down."""
     world.kubelet.auto = False
@@ -112,8 +121,14 @@ async def meets_masters(world: World) -> None:
     """Attach masters of both address families, while the Service is changed from outside."""
     world.store.create("leases", NAMESPACE, {"metadata": {"name": MASTER["leaseName"]}})
     world.edit(master=MASTER, onLost="Delete")
-    world.store.merge("services", NAMESPACE, "es-fiber", {"spec": {"selector": {"app": "x"}}})
-    await world.until(lambda: bool(counted(world, "patch", "services")))
+    meddled = {"spec": {"selector": {"app": "x"}}}
+    world.store.merge("services", NAMESPACE, "es-fiber", meddled)
+    await world.until(
+        lambda: (
+            "selector" not in world.store.get("services", NAMESPACE, "es-fiber")["spec"]
+            and bool(counted(world, "patch", "endpointslices"))
+        )
+    )
     world.edit(master={**MASTER, "host": "fd00::7"})
     await world.until(lambda: bool(counted(world, "delete", "endpointslices")))
 

@@ -7,7 +7,15 @@ from e2e.program import Program
 from e2e.scene import Scene
 from fiber_api import names
 
-_OWN = ("fiberpools", "pods", "secrets", "leases", "services", "endpointslices")
+_OWN = (
+    "fiberpools",
+    "pods",
+    "secrets",
+    "leases",
+    "services",
+    "endpointslices",
+    "deployments",
+)
 _NOT_THEIRS = {f"leases/{names.SERVING_LEASE}"}
 """The Lease by which the operator shows that it serves the namespace."""
 

@@ -119,16 +119,23 @@ def workers_policy(release: Release, namespace: str, master: Body) -> Body:
 
 
 def rendered_policy(release: Release, values: Body) -> Body:
+    """Return the chart's only policy that is not about relays."""
     manifests = yaml.safe_load_all(release.render(values))
-    (policy,) = (found for found in manifests if found and found["kind"] == "NetworkPolicy")
+    policies = [found for found in manifests if found and found["kind"] == "NetworkPolicy"]
+    (policy,) = (one for one in policies if not one["metadata"]["name"].endswith("-relays"))
     return dict(policy)
 
 
 def egress(policy: Body, peers: Mapping[str, str]) -> Iterator[Allowed]:
-    """Yield the traffic that the policy lets out; ``peers`` has the addresses of selected pods."""
+    """Yield the traffic that the policy lets out; ``peers`` has the addresses of selected pods.
+
+    Pods that are not in ``peers``, such as relays, do not exist here.
+    """
     assert policy["spec"]["policyTypes"] == ["Ingress", "Egress"]
     for rule in policy["spec"]["egress"]:
         for peer in rule.get("to", [{"ipBlock": {"cidr": "0.0.0.0/0"}}]):
+            if "ipBlock" not in peer and str(peer) not in peers:
+                continue
             address = peer["ipBlock"]["cidr"] if "ipBlock" in peer else peers[str(peer)]
             for port in rule["ports"]:
                 yield Allowed(address, port["protocol"].lower(), port["port"])

@@ -12,6 +12,7 @@ FIBER_USER = {
     "secrets": {"create"},
     "leases": {"create", "get", "patch", "update"},
     "pods": {"get", "list", "watch"},
+    "pods/portforward": {"create", "get"},
     "persistentvolumeclaims": {"get"},
 }
 """Verbs by resource; ``tests/chart`` compares them with the chart."""
@@ -28,7 +29,8 @@ class FiberUser:
     def allow(self, call: Call) -> bool:
         """Return True if the account may make this call."""
         if call.namespace == self.namespace:
-            return call.verb in FIBER_USER.get(call.plural, ())
+            resource = f"{call.plural}/{call.subresource}" if call.subresource else call.plural
+            return call.verb in FIBER_USER.get(resource, ())
         sees = (call.namespace, call.plural, call.verb, call.name)
         return self.sees_operators and sees == (
             names.SERVING_NAMESPACE,

@@ -25,6 +25,7 @@ KINDS = {
     "persistentvolumeclaims": ("v1", "PersistentVolumeClaim"),
     "namespaces": ("v1", "Namespace"),
     "endpointslices": ("discovery.k8s.io/v1", "EndpointSlice"),
+    "deployments": ("apps/v1", "Deployment"),
     "poddisruptionbudgets": ("policy/v1", "PodDisruptionBudget"),
     "leases": ("coordination.k8s.io/v1", "Lease"),
     "customresourcedefinitions": ("apiextensions.k8s.io/v1", "CustomResourceDefinition"),

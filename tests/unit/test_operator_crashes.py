@@ -106,6 +106,18 @@ async def is_attached(world: World) -> None:
     assert slice_["ports"][0]["port"] == 41338
 
 
+async def relay(world: World) -> None:
+    world.edit(relay=True)
+
+
+async def is_relayed(world: World) -> None:
+    await world.until(lambda: "relay" in world.status())
+    assert len(world.store.list("deployments", NAMESPACE)) == 1
+    assert "selector" in world.store.get("services", NAMESPACE, "es-fiber")["spec"]
+    (slice_,) = world.store.list("endpointslices")
+    assert slice_["endpoints"] == []
+
+
 async def abandon(world: World) -> None:
     world.store.create("leases", NAMESPACE, {"metadata": {"name": "es"}})
     lost = {"leaseName": "es", "leaseDurationSeconds": 6, "lostGraceSeconds": 5}
@@ -179,6 +191,7 @@ STORIES: dict[str, tuple[bool, tuple[Step, Step]]] = {
     "template": (True, (change_template, is_changed)),
     "suspend": (True, (suspend, is_suspended)),
     "new-master": (True, (attach, is_attached)),
+    "relay": (True, (relay, is_relayed)),
     "lost-master": (True, (abandon, is_deleted)),
 }
 

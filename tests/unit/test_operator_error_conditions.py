@@ -88,6 +88,16 @@ async def gives_up_its_budget(world: World) -> None:
     world.edit(minAvailable=None)
 
 
+async def gets_a_relay(world: World) -> None:
+    world.edit(relay=True)
+
+
+async def gives_up_its_relay(world: World) -> None:
+    await gets_a_relay(world)
+    await world.until(lambda: "relay" in world.status(), within=60)
+    world.edit(relay=False)
+
+
 async def is_made_anew(world: World) -> None:
     world.store.delete("fiberpools", NAMESPACE, "es")
     world.make_pool(replicas=2)
@@ -109,6 +119,9 @@ LIVES: dict[Right, Callable[[World], Awaitable[None]]] = {
     ("get", "poddisruptionbudgets"): gets_a_budget,
     ("patch", "poddisruptionbudgets"): changes_its_budget,
     ("delete", "poddisruptionbudgets"): gives_up_its_budget,
+    ("create", "deployments"): gets_a_relay,
+    ("get", "deployments"): gets_a_relay,
+    ("delete", "deployments"): gives_up_its_relay,
     ("get", "leases"): loses_its_master,
     ("delete", "fiberpools"): loses_its_master,
 }

@@ -17,7 +17,7 @@ from fakes.world import NAMESPACE, World, a_world
 from fiber_api.times import format_time
 from fiber_api.v1alpha1 import FiberPool, InvalidPool
 from fiber_operator.metrics import PoolSample
-from fiber_operator.planning import plans
+from fiber_operator.planning import plans, relay
 from fiber_operator.planning.manifests import template_hash
 from fiber_operator.planning.plans import Knowledge, Plan
 from fiber_operator.planning.pods import PodView, observe
@@ -101,6 +101,7 @@ SPEC: Body = {
     "minReplicas": 1,
     "maxReplicas": 9,
     "master": {**MASTER, "leaseName": "es"},
+    "relay": True,
     "onLost": "Delete",
     "idle": {"timeoutSeconds": 60},
     "scaleDown": {"policy": "ReleasedOnly", "release": [name_of(77)], "idleTimeoutSeconds": 5},
@@ -207,6 +208,7 @@ def test_garbage_in_the_spec_can_be_planned_or_is_reported(
     if not errors:
         check_plan(pool, document, VIEWS, alive)
         json.dumps(pod(pool, name_of(1), ADDRESS))
+        json.dumps(relay.deployment(pool))
         return
     made = plan_unreadable(document, VIEWS, errors, NOW)
     assert (made.create, made.delete, made.delete_pool) == (0, (), False)
@@ -365,7 +367,7 @@ def test_an_operator_outlives_garbage_in_a_pod(data: st.DataObject) -> None:
 
 
 @EXAMPLES
-@given(st.data(), st.sampled_from(["services", "endpointslices", "secrets"]))
+@given(st.data(), st.sampled_from(["services", "endpointslices", "secrets", "deployments"]))
 def test_an_operator_survives_garbage_in_the_objects_of_a_pool(
     data: st.DataObject, plural: str
 ) -> None:

@@ -25,7 +25,7 @@ def selector(pool: FiberPool) -> str:
 
 
 def service(pool: FiberPool) -> dict[str, Any]:
-    """Return the Service that agents dial.  It has no selector.
+    """Return the Service that agents dial.  It has a selector only if it leads to a relay.
 
     It has both IP families if the cluster has both: the master may have either, and agents dial
     both.
@@ -36,12 +36,30 @@ def service(pool: FiberPool) -> dict[str, Any]:
         "targetPort": names.MASTER_PORT,
         "protocol": "TCP",
     }
+    spec = {"type": "ClusterIP", "ipFamilyPolicy": "PreferDualStack", "ports": [port]}
     return {
         "apiVersion": "v1",
         "kind": "Service",
         "metadata": _metadata(pool, names.service_name(pool.metadata.name)),
-        "spec": {"type": "ClusterIP", "ipFamilyPolicy": "PreferDualStack", "ports": [port]},
+        "spec": {**spec, "selector": relay_selector(pool)} if pool.spec.relay else spec,
     }
+
+
+def relay_selector(pool: FiberPool) -> dict[str, str]:
+    """Return the labels of the relay's pod, and of no other pod."""
+    return {names.LABEL_RELAY: pool.metadata.uid}
+
+
+def selector_patch(pool: FiberPool, there: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the merge patch of the Service's spec that corrects the selector ``there``.
+
+    The relay's selector stays when the relay goes.  Kubernetes then removes the pod's address from
+    the Service, which it would not do for a Service without a selector.
+    """
+    relays = relay_selector(pool)
+    if there == relays or not (there or pool.spec.relay):
+        return {}
+    return {"selector": {**dict.fromkeys(there), **relays} if pool.spec.relay else None}
 
 
 def endpoint_slice(pool: FiberPool) -> dict[str, Any]:

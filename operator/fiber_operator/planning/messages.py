@@ -426,6 +426,16 @@ def object_obstacle(error: ApiError, what: str) -> Obstacle:
     return Obstacle(Reason.API_UNAVAILABLE, message)
 
 
+def refused_relay(error: Invalid, name: str) -> Obstacle:
+    """Return the obstacle after the API server refused the Deployment of the pool's relay."""
+    message = (
+        f"The API server refuses the Deployment {name} of the pool's relay{quoted(error.message)}. "
+        "The relay's pod is made from spec.template: correct that, or the policy or webhook that "
+        "refuses it."
+    )
+    return Obstacle(Reason.INVALID_TEMPLATE, message)
+
+
 def creation_obstacle(error: ApiError) -> Obstacle:
     """Return the obstacle after a failed creation of a pod."""
     message = (

@@ -164,7 +164,8 @@ def _masters(situation: Situation) -> Iterator[Problem]:
     if pool.spec.master and knowledge.master.unreadable:
         message = messages.unreadable_lease(pool, knowledge.master.unreadable)
         yield situation.problem(Reason.FORBIDDEN, message, severity="Warning")
-    if pool.spec.master and knowledge.address and _families_differ(pool, knowledge.address):
+    direct = pool.spec.master and not pool.spec.relay
+    if direct and knowledge.address and _families_differ(pool, knowledge.address):
         message = messages.wrong_family(pool, knowledge.address)
         yield situation.problem(Reason.INVALID_SPEC, message, terminal=True)
 

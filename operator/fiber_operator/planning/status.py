@@ -533,7 +533,8 @@ def _masters(change: Change) -> Iterator[PoolEvent]:
     if (before.master, before.master_epoch) == (after.master, after.master_epoch):
         return
     if after.master:
-        message = f"Workers dial the master at {after.master}, epoch {after.master_epoch}"
+        way = " through a relay" if after.relay else ""
+        message = f"Workers dial the master at {after.master}, epoch {after.master_epoch}{way}"
     else:
         message = "The master has left; the workers wait for the next one"
     yield PoolEvent("Normal", Reason.MASTER_CHANGED, message)
