@@ -21,7 +21,7 @@ from unit.kubernetes_rig import NAMESPACE, OTHER, Body, kubeconfig, pool_body
 
 
 class Outcome(NamedTuple):
-    """What a command printed, and its exit status."""
+    """Output of a command, and its exit status."""
 
     status: int
     out: str

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     import click
 
 _COMMANDS = {
+    "image": "Build an image for workers from this environment.",
     "pool": "List, make and scale FiberPools.",
 }
 """Names of the commands, and their help in one line.  Each has a module of its name."""
