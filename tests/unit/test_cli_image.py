@@ -175,7 +175,13 @@ def test_the_registry_of_a_name() -> None:
 
 @pytest.mark.parametrize(
     "words",
-    [["--tag", "Bad Name"], ["--tag", "user:secret@registry/name"], ["--push"], ["--tag", "-x"]],
+    [
+        ["--tag", TAG, "--without", "FiberPool"],
+        ["--tag", "Bad Name"],
+        ["--tag", "user:secret@registry/name"],
+        ["--push"],
+        ["--tag", "-x"],
+    ],
     ids=" ".join,
 )
 def test_a_mistake_of_the_command_line(site: Environment, words: list[str]) -> None:
@@ -305,10 +311,10 @@ def test_pip_is_asked_by_a_file_and_not_by_arguments(
 
     def ask(command: list[str], **options: object) -> subprocess.CompletedProcess[str]:
         asked.append((" ".join(command), Path(command[-1]).read_text()))
-        return subprocess.CompletedProcess(command, 1, "", "ERROR: no network")
+        return subprocess.CompletedProcess(command, 1, "", f"ERROR: no {url}")
 
     monkeypatch.setattr("fiber._cli.image_wheels.subprocess.run", ask)
-    assert "no network" in refused(run("image", "build", "--file-only"))[1]
+    assert refused(run("image", "build", "--file-only"))[1] == "mine: no https://example/mine.git"
     ((words, text),) = asked
     assert "hidden" not in words
     assert text == f"mine @ git+{url}@abc\n"

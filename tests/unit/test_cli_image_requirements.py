@@ -47,6 +47,11 @@ def test_origins_of_installed_packages(site: Environment, tmp_path: Path) -> Non
     }
 
 
+def test_remains_of_a_removed_package_are_no_package(site: Environment) -> None:
+    (site.folder / "left-1.0.dist-info").mkdir()
+    assert of_environment().requirements == ("fiberpool==0.1",)
+
+
 def test_an_origin_that_cannot_be_read_is_none(site: Environment) -> None:
     site.install("odd", origin=[1])
     assert "odd==1.0" in of_environment().requirements
@@ -66,6 +71,7 @@ def test_fiber_that_no_installer_knows_is_a_problem(site: Environment) -> None:
         file.unlink()
     (site.folder / "fiberpool-0.1.dist-info").rmdir()
     assert "not installed by pip" in fiber_itself().problem
+    assert of_environment().built == (fiber_itself(),)
 
 
 # ---- requirements.txt
@@ -85,7 +91,8 @@ def test_files_and_constraints_that_a_file_includes(site: Environment, tmp_path:
     )
     (tmp_path / "bounds.txt").write_text("six==1.17\n")
     contents = read(tmp_path, "-r more.txt\n-c bounds.txt\nnumpy\n")
-    assert contents.requirements == ("scipy==1.15 --hash=sha256:00", "numpy", "fiberpool==0.1")
+    assert contents.requirements == ("scipy==1.15 --hash=sha256:00", "numpy")
+    assert built(contents) == {"fiberpool": "fiberpool==0.1"}
     assert contents.constraints == ("six==1.17",)
 
 

@@ -12,7 +12,7 @@ import click
 from fiber._cli import image_builders, image_packages, image_pip, image_requirements, image_settings
 from fiber._cli.image_builders import Builder
 from fiber._cli.image_context import BASE, emptied, write_context
-from fiber._cli.image_packages import Contents
+from fiber._cli.image_packages import FIBER, Contents, canonical
 
 _PART = r"[a-z0-9]+(?:(?:\.|_{1,2}|-+)[a-z0-9]+)*"
 _TAG = re.compile(
@@ -39,6 +39,14 @@ def _checked_tag(ctx: click.Context, param: click.Parameter, tag: str | None) ->
     return tag
 
 
+def _checked_names(
+    ctx: click.Context, param: click.Parameter, names: tuple[str, ...]
+) -> tuple[str, ...]:
+    if FIBER in map(canonical, names):
+        raise click.BadParameter(f"workers need {FIBER}", ctx, param)
+    return names
+
+
 @command.command("build")
 @click.option(
     "--tag",
@@ -61,7 +69,13 @@ def _checked_tag(ctx: click.Context, param: click.Parameter, tag: str | None) ->
     type=click.Path(dir_okay=False, path_type=Path),
     help="requirements.txt, pyproject.toml or uv.lock, in place of this environment's packages.",
 )
-@click.option("--without", metavar="PACKAGE", multiple=True, help="Package to leave out.")
+@click.option(
+    "--without",
+    metavar="PACKAGE",
+    multiple=True,
+    callback=_checked_names,
+    help="Package to leave out.",
+)
 @click.option("--platform", metavar="OS/ARCH", help="Platform of the nodes, as linux/amd64.")
 @click.option(
     "--file-only",

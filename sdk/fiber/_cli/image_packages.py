@@ -62,7 +62,9 @@ def canonical(name: str) -> str:
 def of_environment(without: Collection[str] = ()) -> Contents:
     """Return the packages of this environment, except those in ``without``."""
     left_out = {canonical(name) for name in without} | _IN_EACH_IMAGE
-    packages = [each for each in installed() if canonical(each.name) not in left_out]
+    packages = [each for each in installed() if canonical(each.name) not in {*left_out, FIBER}]
+    packages.append(fiber_itself())
+    packages.sort(key=lambda each: canonical(each.name))
     return Contents(
         tuple(each.pin for each in packages if not each.made_of and not each.problem),
         tuple(each for each in packages if each.made_of or each.problem),
@@ -84,9 +86,11 @@ def installed() -> list[Package]:
     """Return the packages that this interpreter finds, sorted by name."""
     found: dict[str, Package] = {}
     for distribution in metadata.distributions():
-        name = distribution.metadata["Name"]
-        if name and canonical(name) not in found:  # the first on the path is imported
-            found[canonical(name)] = package_of(distribution)
+        if "Name" not in distribution.metadata:
+            continue  # remains of a package that was removed
+        name = canonical(distribution.metadata["Name"])
+        if name not in found:  # the first on the path is imported
+            found[name] = package_of(distribution)
     return [found[name] for name in sorted(found)]
 
 

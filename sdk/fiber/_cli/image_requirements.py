@@ -49,6 +49,9 @@ def of_file(file: Path, without: Collection[str] = ()) -> Contents:
     lines = [line for line in contents.requirements if canonical(name_in(line)) not in names]
     if fiber.made_of or fiber.problem:
         built.append(fiber)
+    elif any("--hash" in line for line in lines):
+        # pip wants a hash of each line or of none, and this machine knows no hash of Fiber.
+        built.append(fiber._replace(made_of=fiber.pin))
     else:
         lines.append(fiber.pin)
     constraints = [line for line in contents.constraints if canonical(name_in(line)) not in names]

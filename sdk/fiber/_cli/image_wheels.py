@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 import shutil
 import subprocess
 import sys
@@ -14,6 +15,9 @@ import click
 
 from fiber._cli.failures import CommandError
 from fiber._cli.image_packages import FIBER, Package, canonical
+
+_USER = re.compile(r"//[^/@\s]+@")
+"""User and password in a URL, which no message shows."""
 
 _FOR_LINUX = ("any", "linux", "manylinux", "musllinux")
 
@@ -95,4 +99,4 @@ def _last_words(text: str) -> str:
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     errors = [line for line in lines if line.lower().startswith("error")]
     said = (errors or lines or ["pip made no wheel"])[-1]
-    return said.removeprefix("ERROR: ")
+    return _USER.sub("//", said.removeprefix("ERROR: "))
