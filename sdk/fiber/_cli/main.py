@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     import click
 
 _COMMANDS = {
-    "image": "Build an image for workers from this environment.",
     "pool": "List, make and scale FiberPools.",
+    "image": "Build an image for workers from this environment.",
 }
 """Names of the commands, and their help in one line.  Each has a module of its name."""
 
