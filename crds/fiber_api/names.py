@@ -27,6 +27,8 @@ CRD_NAME: Final = f"{PLURAL}.{GROUP}"
 
 SDK_MANAGER: Final = "fiber-sdk"
 """Owner of ``spec.replicas``, ``spec.scaleDown.release``, ``spec.master`` and ``spec.relay``."""
+COMMAND_MANAGER: Final = "fiber-cli"
+"""Owner of what a person sets by the command ``fiber``.  A program's next apply leaves it alone."""
 OPERATOR_MANAGER: Final = "fiber-operator"
 """Owner of the status, the pods, the Service, its EndpointSlice, the relay and the Secret, unless
 ``spec.credentialsSecretName`` names one; never of the spec."""

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 _COMMANDS = {
     "run": "Run a program in a pod, and follow it.",
     "pool": "List, make and scale FiberPools.",
+    "image": "Build an image for workers from this environment.",
 }
 """Names of the commands, and their help in one line.  Each has a module of its name."""
 

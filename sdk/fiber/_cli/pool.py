@@ -6,10 +6,17 @@ from typing import Any
 
 import click
 
-from fiber._cli import display
-from fiber._cli.failures import explained
-from fiber._cli.session import Session, cluster_options, connect, output_option
-from fiber_api.rest import POOLS, Body
+from fiber._cli import (
+    display,
+    pool_access,
+    pool_apply,
+    pool_changes,
+    pool_hand_back,
+    pool_show,
+    pool_warm,
+)
+from fiber._cli.session import cluster_options, output_option
+from fiber_api.rest import Body
 from fiber_api.times import parse_time
 
 
@@ -35,16 +42,10 @@ def list_pools(namespace: str | None, context: str | None, output: str) -> None:
       fiber pool list
       fiber pool list --namespace team-a --output json
     """
-    session = connect(context, namespace)
-    rows = [row_of(pool) for pool in _pools(session)]
+    session = pool_access.opened(context, namespace)
+    rows = [row_of(pool) for pool in pool_access.pools(session)]
     columns = ["name", "phase", "ready", "wanted", "master", "age"]
     display.show(rows, columns, output, f"there is no FiberPool in {session.where}")
-
-
-def _pools(session: Session) -> list[Body]:
-    with explained("list the FiberPools"):
-        listing = session.api.list(POOLS.path(session.namespace), timeout=5.0)
-    return list(listing.get("items") or ())
 
 
 def row_of(pool: Body) -> dict[str, Any]:
@@ -58,3 +59,16 @@ def row_of(pool: Body) -> dict[str, Any]:
         "master": (spec.get("master") or {}).get("identity"),
         "age": display.age(parse_time(pool["metadata"]["creationTimestamp"])),
     }
+
+
+for _each in (
+    pool_show.show,
+    pool_apply.apply,
+    pool_changes.scale,
+    pool_changes.suspend,
+    pool_changes.resume,
+    pool_warm.warm,
+    pool_hand_back.hand_back,
+    pool_hand_back.delete,
+):
+    command.add_command(_each)

@@ -121,15 +121,25 @@ class Api:
 
     def apply(self, path: str, body: Body, **how: Unpack[_How]) -> Body:
         """Apply ``body`` on the server; fields of the last apply that it lacks are removed."""
-        kind = "application/apply-patch+yaml"
-        return self._call(
-            ApiRequest("PATCH", path, {**_AS_SDK, "force": "true"}, body, kind), **how
-        )
+        return self._apply(path, body, {**_AS_SDK, "force": "true"}, **how)
 
-    def merge_patch(self, path: str, patch: Body, **how: Unpack[_How]) -> Body:
+    def apply_manifest(
+        self, path: str, body: Body, *, force: bool = False, **how: Unpack[_How]
+    ) -> Body:
+        """Apply a person's ``body``; the fields that programs write stay theirs.
+
+        Conflict if another writer set one of the fields, unless ``force`` takes it over; Invalid
+        for fields that the API server does not know.
+        """
+        query = {"fieldManager": names.COMMAND_MANAGER, "fieldValidation": "Strict"}
+        return self._apply(path, body, {**query, **({"force": "true"} if force else {})}, **how)
+
+    def merge_patch(
+        self, path: str, patch: Body, *, manager: str = names.SDK_MANAGER, **how: Unpack[_How]
+    ) -> Body:
         """Patch an object: None removes a field, a list replaces a list."""
         kind = "application/merge-patch+json"
-        return self._call(ApiRequest("PATCH", path, _AS_SDK, patch, kind), **how)
+        return self._call(ApiRequest("PATCH", path, {"fieldManager": manager}, patch, kind), **how)
 
     def delete(self, path: str, *, uid: str | None = None, **how: Unpack[_How]) -> Body:
         """Delete an object and those that it owns; Conflict if its uid is not ``uid``."""
@@ -157,6 +167,10 @@ class Api:
         """Connect to a port on the loopback of the pod at the path ``pod``."""
         query = {"ports": str(port)}
         return self._session.port_forward(ApiRequest("GET", f"{pod}/portforward", query))
+
+    def _apply(self, path: str, body: Body, query: Mapping[str, str], **how: Unpack[_How]) -> Body:
+        kind = "application/apply-patch+yaml"
+        return self._call(ApiRequest("PATCH", path, query, body, kind), **how)
 
     def _call(
         self,
