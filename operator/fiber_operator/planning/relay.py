@@ -29,8 +29,10 @@ _OF_THE_POD = (
     "priorityClassName",
     "runtimeClassName",
     "schedulerName",
+    "serviceAccountName",
 )
-"""Fields of the template's pod that decide where a pod may run."""
+"""Fields of the template's pod that decide where a pod may run.  The account is for its pull secrets
+alone: the pod gets no token."""
 
 _OF_THE_SECURITY_CONTEXT = (
     "fsGroup",

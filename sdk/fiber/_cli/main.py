@@ -14,6 +14,9 @@ if TYPE_CHECKING:
 
 _COMMANDS = {
     "run": "Run a program in a pod, and follow it.",
+    "ps": "List the programs of a namespace.",
+    "logs": "Show the output of a program, or of a worker.",
+    "stop": "End a program.",
     "pool": "List, make and scale FiberPools.",
     "image": "Build an image for workers from this environment.",
 }

@@ -1,0 +1,98 @@
+"""``fiber logs``: the output of a program, or of one of its workers."""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+
+import click
+
+from fiber._cli.failures import USAGE, CommandError, explained, not_found
+from fiber._cli.programs import find_job, find_pod
+from fiber._cli.ps import host_of
+from fiber._cli.session import Session, cluster_options, connect
+from fiber_api import names
+from fiber_api.rest import PODS, POOLS, NotFound
+
+_UNITS = {"s": 1, "m": 60, "h": 3600, "d": 86_400}
+
+
+@click.command("logs")
+@click.argument("name")
+@click.option("--worker", metavar="POD", help="Worker instead of the program: its pod.")
+@click.option("-f", "--follow", is_flag=True, help="Go on until the end.")
+@click.option("--since", metavar="TIME", help="Only newer output: 30s, 5m, 2h or 1d.")
+@cluster_options
+def command(
+    name: str,
+    worker: str | None,
+    follow: bool,
+    since: str | None,
+    namespace: str | None,
+    context: str | None,
+) -> None:
+    """Show the output of a program that `fiber run` started, or of a worker.
+
+    A program that has ended keeps its log for an hour.
+
+    \b
+    Examples:
+      fiber logs train-4f2a1 --follow
+      fiber logs train-4f2a1 --worker train-1c0de-9e107d9d37 --since 5m
+    """
+    query = {"follow": "true"} if follow else {}
+    if since is not None:
+        query["sinceSeconds"] = str(_seconds(since))
+    session = connect(context, namespace)
+    find_job(session, name)
+    pod = _worker(session, name, worker) if worker else _pod(session, name)
+    with explained(f"read the log of {pod}"):
+        try:
+            for piece in session.api.log(PODS.path(session.namespace, pod), query):
+                sys.stdout.flush()
+                os.write(sys.stdout.fileno(), piece)
+        except NotFound as error:
+            raise CommandError(f"there is no pod {pod!r} any longer", error.message) from error
+
+
+def _pod(session: Session, program: str) -> str:
+    pod = find_pod(session, program)
+    if pod is None:
+        raise CommandError(
+            f"the program {program!r} has no pod",
+            "it has not started yet, or its pod was deleted",
+            f"see `kubectl describe job {program} -n {session.namespace}`",
+        )
+    return pod.name
+
+
+def _worker(session: Session, program: str, worker: str) -> str:
+    """Return ``worker`` if it is one of the program's."""
+    found = workers_of(session, program)
+    if worker not in found:
+        raise not_found("worker", worker, found, f"the program {program!r}")
+    return worker
+
+
+def workers_of(session: Session, program: str) -> list[str]:
+    """Return the names of the pods of a program's workers."""
+    host = _pod(session, program)
+    with explained("list the workers"):
+        pools = session.api.list(POOLS.path(session.namespace), timeout=5.0).get("items") or ()
+        uids = [str(pool["metadata"]["uid"]) for pool in pools if host_of(pool) == host]
+        found: list[str] = []
+        for uid in uids:
+            selector = {"labelSelector": f"{names.LABEL_POOL_UID}={uid}"}
+            listing = session.api.list(PODS.path(session.namespace), selector, timeout=5.0)
+            found += [str(pod["metadata"]["name"]) for pod in listing.get("items") or ()]
+    return found
+
+
+def _seconds(text: str) -> int:
+    found = re.fullmatch(r"(\d+)([smhd])", text)
+    if found is None or not int(found[1]):
+        raise CommandError(
+            f"{text!r} is no time", "--since needs a number and a unit", "--since 5m", USAGE
+        )
+    return int(found[1]) * _UNITS[found[2]]
