@@ -160,7 +160,7 @@ def test_a_relay_meets_the_restricted_security_standard() -> None:
     assert spec["containers"][0]["securityContext"] == RESTRICTED
 
 
-def test_a_relay_has_no_secret_no_account_and_no_variable_of_the_template() -> None:
+def test_a_relay_has_no_secret_no_token_and_no_variable_of_the_template() -> None:
     pod = {
         "serviceAccountName": "robot",
         "automountServiceAccountToken": True,

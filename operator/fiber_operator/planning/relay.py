@@ -31,8 +31,8 @@ _OF_THE_POD = (
     "schedulerName",
     "serviceAccountName",
 )
-"""Fields of the template's pod that decide where a pod may run.  The account is for its pull secrets
-alone: the pod gets no token."""
+"""Fields of the template's pod that decide where a pod may run.  The account is there for its pull
+secrets: the pod gets no token."""
 
 _OF_THE_SECURITY_CONTEXT = (
     "fsGroup",

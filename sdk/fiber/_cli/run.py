@@ -52,6 +52,8 @@ class Source(NamedTuple):
     """Command to run, and the files that it needs."""
 
     command: list[str]
+    words: str
+    """The command line, as the user typed it."""
     name: str
     archive: bytes
     layout: str
@@ -140,6 +142,7 @@ def _run_here(options: dict[str, Any]) -> None:
 def _source(options: dict[str, Any]) -> Source:
     """Return the program and its files."""
     words = _command(options, "python")
+    typed = shlex.join(words)
     program = _program_file(options)
     preparation = spawn.get_preparation_data("")
     preparation.pop("init_main_from_path", None)
@@ -159,6 +162,7 @@ def _source(options: dict[str, Any]) -> Source:
     search = [*paths.before_library, *paths.before_installed]
     return Source(
         words,
+        typed,
         program_name(program.file) if program.file else _word(words[0]),
         archive,
         json.dumps({"directory": paths.directory, "path": search}),
@@ -254,7 +258,7 @@ def _job(name: str, source: Source, options: dict[str, Any], settings: config.Co
         "metadata": {
             "name": name,
             "labels": labels,
-            "annotations": {names.ANNOTATION_COMMAND: shlex.join(source.command)},
+            "annotations": {names.ANNOTATION_COMMAND: source.words},
         },
         "spec": spec,
     }
