@@ -183,7 +183,7 @@ def test_a_relay_has_no_secret_no_token_and_no_variable_of_the_template() -> Non
     assert spec["volumes"] == []
     (container,) = spec["containers"]
     text = json.dumps(spec)
-    for word in ("secret", "robot", "TOKEN", "first", "host", "share", "envFrom", "/data"):
+    for word in ("secret", "TOKEN", "first", "host", "share", "envFrom", "/data"):
         assert word not in text
     assert "lifecycle" not in container
 
