@@ -96,6 +96,10 @@ class KubernetesApi:
         """Values of Authorization that are let in; None: anybody."""
         self.allows: Callable[[Call], bool] = lambda call: True
         """Decision whether clients that send a token may make such a call; others may make all."""
+        self.documents: dict[str, Body | None] = {}
+        """Answers by path, in place of those below; None: the path is not served."""
+        self.date: str | None = None
+        """Header ``Date`` of these answers; None: the time of this machine."""
         self.port = 0
         self.server: Callable[[], asyncio.Protocol]
         """Makes the protocol of a connection, for clients that need no socket."""
@@ -135,11 +139,9 @@ class KubernetesApi:
     async def _serve(self, request: web.Request) -> web.StreamResponse:
         if not self._answers():
             return _reset(request)
-        found = discovery(request.path)
-        if found is not None:
-            return web.json_response(found)
-        if request.path == _REVIEWS:
-            return web.json_response(self._review(await request.json()))
+        about = await self._answer_without_objects(request)
+        if about is not None:
+            return about
         call = _parse(request)
         if call is None:
             return web.Response(status=404, text="404 page not found")
@@ -165,9 +167,24 @@ class KubernetesApi:
             return answer
         return _faulty(request, fault)
 
+    async def _answer_without_objects(self, request: web.Request) -> web.Response | None:
+        """Return the answer to a question about the API or a right; None if it is another."""
+        found = self.documents.get(request.path, discovery(request.path))
+        if found is None and request.path not in (_REVIEWS, *self.documents):
+            return None
+        if self.accepts is not None and request.headers.get("Authorization") not in self.accepts:
+            return _refused(Failure(401, "Unauthorized", "Unauthorized"))
+        if request.path == _REVIEWS:
+            return web.json_response(self._review(await request.json()))
+        if found is None:
+            return web.Response(status=404, text="404 page not found")
+        headers = {} if self.date is None else {"Date": self.date}
+        return web.json_response(found, headers=headers)
+
     def _review(self, body: Body) -> Body:
         asked = body["spec"]["resourceAttributes"]
-        call = Call(asked["verb"], asked["resource"], asked["namespace"])
+        place = (asked["verb"], asked["resource"], asked["namespace"])
+        call = Call(*place, asked.get("name", ""), asked.get("subresource", ""))
         return {**body, "status": {"allowed": self.allows(call)}}
 
     async def _carry_out(self, request: web.Request, call: Call) -> web.StreamResponse:
@@ -325,7 +342,7 @@ def discovery(path: str) -> Body | None:
         {
             "name": plural,
             "singularName": KINDS[plural][1].lower(),
-            "namespaced": plural not in ("namespaces", "customresourcedefinitions"),
+            "namespaced": plural not in ("namespaces", "nodes", "customresourcedefinitions"),
             "kind": KINDS[plural][1],
             "verbs": ["create", "delete", "get", "list", "patch", "update", "watch"],
         }

@@ -18,6 +18,7 @@ _COMMANDS = {
     "logs": "Show the output of a program, or of a worker.",
     "stop": "End a program.",
     "pool": "List, make and scale FiberPools.",
+    "doctor": "Find out why programs do not get workers.",
     "image": "Build an image for workers from this environment.",
 }
 """Names of the commands, and their help in one line.  Each has a module of its name."""
