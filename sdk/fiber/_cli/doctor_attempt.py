@@ -27,7 +27,7 @@ from fiber._cli.pool_access import is_of_program
 from fiber.config import Config
 from fiber_api import names
 from fiber_api.names import Reason
-from fiber_api.rest import PODS, POOLS, ApiError, Body, NotFound
+from fiber_api.rest import PODS, POOLS, ApiError, Body, NotFound, NotServed
 
 _LOOK_AGAIN = 0.2
 _CALL = 5.0
@@ -231,7 +231,7 @@ class _Attempt:
             found = self._api.get(path, timeout=_CALL)
             if found["metadata"]["uid"] == uid and "deletionTimestamp" not in found["metadata"]:
                 self._api.delete(path, uid=uid, timeout=_CALL)
-        except NotFound:
+        except (NotFound, NotServed):
             pass
         except ApiError as error:
             self._trial.left = f"the FiberPool {name!r} ({error.message})"

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import fiber
 from fiber._cli.doctor_capacity import refusing_quota, refusing_range, requests_of, room
-from fiber._cli.doctor_facts import Answer, Facts, NoPlace, Place, FirstAnswer
+from fiber._cli.doctor_facts import Answer, Facts, FirstAnswer, NoPlace, Place
 from fiber._cli.doctor_rights import (
     PROGRAM_RIGHTS,
     ROLE,
