@@ -63,6 +63,10 @@ class DoctorCluster:
         """Remove the Lease by which it shows that it serves."""
         self.remove("leases", names.SERVING_LEASE, names.SERVING_NAMESPACE)
 
+    def stop_operator(self) -> None:
+        """Let the operator's Lease be an hour old."""
+        self.renew(time.time() - 3600)
+
     def renew(self, moment: float) -> None:
         """Let the operator have renewed its Lease at this time."""
         place = ("leases", names.SERVING_NAMESPACE, names.SERVING_LEASE)

@@ -30,7 +30,6 @@ KEPT = ("fiberpools", "pods", "secrets", "services", "endpointslices")
 def cluster(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeCluster]:
     with fake_cluster() as cluster:
         monkeypatch.setenv("KUBECONFIG", str(kubeconfig(tmp_path, cluster.url)))
-        monkeypatch.setenv("FIBER_LISTEN_HOST", "127.0.0.1")
         cluster.world.api.documents[SCHEMA] = schema()
         cluster.do(cluster.world.store.create, "namespaces", "", {"metadata": {"name": "lab"}})
         cluster.wait(partial(_serves, cluster))
@@ -61,7 +60,7 @@ def test_a_worker_runs_a_task(cluster: FakeCluster) -> None:
 
 
 def test_an_image_that_cannot_be_pulled_is_named(cluster: FakeCluster) -> None:
-    cluster.nodes.fails_with = ("ErrImagePull", "registry.example: no such host")
+    cluster.nodes.fails_with = ("ImagePullBackOff", "registry.example: no such host")
     (found,) = trial()
     assert "cannot pull the image" in found["what"], found
     assert "no such host" in found["why"]

@@ -11,7 +11,7 @@ from fiber._cli.doctor_attempt import attempt
 from fiber._cli.doctor_checks import examine, hidden, obstacle
 from fiber._cli.doctor_facts import Facts, Gatherer, Place, Wishes
 from fiber._cli.doctor_trial_verdicts import NAME, Program, judge
-from fiber._cli.doctor_verdicts import State, Verdict, unknown
+from fiber._cli.doctor_verdicts import State, Verdict, lines_of, unknown
 from fiber._cli.failures import FAILED
 from fiber._cli.session import cluster_options, output_option
 from fiber.config import Config
@@ -80,5 +80,5 @@ def _tell(line: str) -> None:
 
 def _show(verdicts: Iterable[Verdict], output: str) -> None:
     if output == "table":
-        for verdict in verdicts:
-            click.echo("\n".join(verdict.lines()))
+        for line in lines_of(verdicts):
+            click.echo(line)

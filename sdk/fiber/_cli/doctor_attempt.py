@@ -106,20 +106,27 @@ class _Attempt:
         self._pool: Body | None = None
 
     def run(self) -> TrialCourse:
-        with tempfile.TemporaryDirectory(prefix="fiber-doctor-") as folder:
-            command = [sys.executable, "-m", "fiber._cli.doctor_trial"]
-            pipe = subprocess.PIPE
-            with subprocess.Popen(
-                command, stdin=pipe, stdout=pipe, stderr=pipe, cwd=folder, text=True
-            ) as process:
-                try:
-                    self._follow(process)
-                finally:
-                    self._end(process)
-        self._remove_what_is_left()
+        try:
+            with tempfile.TemporaryDirectory(prefix="fiber-doctor-") as folder:
+                self._run_in(folder)
+        finally:
+            self._remove_what_is_left()
         self._await_the_end_of_pods()
         self._note("removed")
         return self._trial
+
+    def _run_in(self, folder: str) -> None:
+        """Run the program in an empty folder, as nothing is to be sent to the worker."""
+        command = [sys.executable, "-m", "fiber._cli.doctor_trial"]
+        pipe = subprocess.PIPE
+        # Ctrl-C is for this process alone, which asks the program to end.
+        with subprocess.Popen(
+            command, stdin=pipe, stdout=pipe, stderr=pipe, cwd=folder, text=True, process_group=0
+        ) as process:
+            try:
+                self._follow(process)
+            finally:
+                self._end(process)
 
     def _follow(self, process: subprocess.Popen[str]) -> None:
         assert process.stdin is not None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
@@ -99,6 +100,17 @@ def _kubeconfig(facts: Facts) -> Iterator[Verdict]:
 def _no_place(place: NoPlace) -> Verdict:
     found = re.search(r"cannot be used: (.*?)\. Set KUBECONFIG", place.error)
     why = found[1] if found else place.error
+    if "not installed" in why:
+        return fault(
+            "a package is missing", why, f"`{sys.executable} -m pip install fiberpool[kubernetes]`"
+        )
+    if not place.kubeconfig:
+        return fault(
+            "this pod has no account for the cluster",
+            why,
+            "give the pod an account with the role fiber-user (serviceAccountName), and do not set "
+            "automountServiceAccountToken to false",
+        )
     if not place.exists:
         return fault(
             "there is no kubeconfig",
@@ -304,24 +316,21 @@ def _rights(facts: Facts, wanted: Sequence[Right], who: str) -> Iterator[Verdict
         yield fault(
             f"this account may not {right}",
             f"{right.only or who} needs this in the namespace {facts.place.namespace!r}",
-            _remedy(facts.place.namespace, right),
+            _remedy(facts.place.namespace, wanted),
         )
     if not missing:
         yield ok(f"this account has all {len(wanted)} rights that {who} needs")
 
 
-def _remedy(namespace: str, right: Right) -> str:
-    if right in PROGRAM_RIGHTS:
+def _remedy(namespace: str, wanted: Sequence[Right]) -> str:
+    if wanted is RUN_RIGHTS:
         return (
-            f"ask an administrator for the role {ROLE}: `kubectl create rolebinding NAME "
-            f"--namespace {namespace} --clusterrole {ROLE} --user YOU`"
+            f"ask an administrator for these rights in the namespace {namespace!r}: a Role with "
+            "them, and a RoleBinding"
         )
-    group = f".{right.group}" if right.group else ""
-    base, _, sub = right.resource.partition("/")
     return (
-        f"ask an administrator for it: `kubectl create role fiber-run --namespace {namespace} "
-        f"--verb {right.verb} --resource {base}{group}{f'/{sub}' if sub else ''}`, and a "
-        "rolebinding"
+        f"ask an administrator for the role {ROLE}: `kubectl create rolebinding NAME "
+        f"--namespace {namespace} --clusterrole {ROLE} --user YOU`"
     )
 
 

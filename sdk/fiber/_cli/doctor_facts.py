@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import socket
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -17,7 +18,7 @@ from typing import Any, NamedTuple
 
 from fiber import config
 from fiber._backends.kubernetes.api import Api, ApiRequest, ApiSession, Login, network_errors
-from fiber._backends.kubernetes.template import PodShape, pod_template
+from fiber._backends.kubernetes.template import PodShape, own_container, pod_template
 from fiber._cli.doctor_rights import PROGRAM_RIGHTS, REVIEWS, RUN_RIGHTS, SCHEMA, Right
 from fiber.config import Config
 from fiber.errors import ConfigError
@@ -73,6 +74,7 @@ class NoPlace(NamedTuple):
     """Reason why no cluster is chosen."""
 
     kubeconfig: str
+    """Path of the kubeconfig; empty for the account of this pod."""
     exists: bool
     context: str | None
     error: str
@@ -146,7 +148,20 @@ class Gatherer:
         if isinstance(facts.server, FirstAnswer):
             facts.now -= facts.server.ahead or 0.0
             self._ask(self.api, facts.place.namespace, facts)
+            if self.api.in_cluster:
+                self._copy_own_pod(self.api, settings, facts)
         return facts
+
+    def _copy_own_pod(self, api: Api, settings: Config, facts: Facts) -> None:
+        """Take the template of a program in this pod, whose workers are like it."""
+        name = os.environ.get("HOSTNAME") or socket.gethostname()
+        with contextlib.suppress(ApiError, ConfigError):
+            own = api.get(PODS.path(api.namespace, name), timeout=SECONDS)
+            shape = PodShape.of(settings)
+            template = pod_template(shape, own, own_container(own, ""))
+            if image_in(template) != image_in(facts.template):
+                facts.image = image_in(template), "this pod"
+            facts.template = template
 
     def _configuration(self) -> Config | ConfigError:
         wishes = {key: value for key, value in self._wishes._asdict().items() if value is not None}
@@ -177,6 +192,8 @@ class Gatherer:
 
     def _connect(self, settings: Config) -> tuple[ApiSession | None, Place | NoPlace]:
         file = os.environ.get("KUBECONFIG") or "~/.kube/config"
+        if "KUBERNETES_SERVICE_HOST" in os.environ and settings.context is None:
+            file = os.environ.get("KUBECONFIG") or ""  # the account of this pod
         try:
             login = Login.find(settings.context)
             session = ApiSession(login)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from enum import StrEnum
 from typing import Any, NamedTuple
 
@@ -27,14 +28,10 @@ class Verdict(NamedTuple):
     check: str = ""
     """Name of the check; ``examine`` fills it in."""
 
-    def lines(self) -> list[str]:
-        """Return the lines for people."""
-        found = [f"{MARKS[self.state]} {self.check}: {self.what}"]
-        if self.why:
-            found.append(f"    why:  {self.why}")
-        if self.do:
-            found.append(f"    do:   {self.do}")
-        return found
+    @property
+    def line(self) -> str:
+        """Line for people."""
+        return f"{MARKS[self.state]} {self.check}: {self.what}"
 
     def document(self) -> dict[str, Any]:
         """Return the verdict for JSON."""
@@ -60,3 +57,15 @@ def fault(what: str, why: str, do: str) -> Verdict:
 def unknown(what: str) -> Verdict:
     """Return the verdict of a check that could not look."""
     return Verdict(State.UNKNOWN, what)
+
+
+def lines_of(verdicts: Iterable[Verdict]) -> Iterator[str]:
+    """Yield the lines for people.  Faults with one reason and remedy have these once, below."""
+    found = list(verdicts)
+    for verdict, following in zip(found, [*found[1:], None], strict=True):
+        yield verdict.line
+        if following is None or verdict[2:] != following[2:]:
+            if verdict.why:
+                yield f"    why:  {verdict.why}"
+            if verdict.do:
+                yield f"    do:   {verdict.do}"
