@@ -41,7 +41,8 @@ _PAUSE = 0.2
 """Seconds without accepting after the process ran out of descriptors."""
 
 _MOST_WAITING = 512
-"""Agents that wait for a master, at most.  Half of them may come from one address."""
+"""Agents that wait for a master, at most.  Half of them may come from one address.  The limit is
+never more than a quarter of the descriptors that this process may have."""
 
 _HELLO_WITHIN = 10.0
 """Seconds in which a master must have said which one it is."""
@@ -65,7 +66,8 @@ class Relay:
         self._epoch = 0
         self._newcomers: dict[Multiplexer, None] = {}
         """Connections that have not said which master they are, or were refused; oldest first."""
-        self._admission = Admission(_MOST_WAITING, _MOST_WAITING // 2)
+        most = min(_MOST_WAITING, max(resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 4, 2))
+        self._admission = Admission(most, most // 2)
         self._waiting: dict[socket.socket, str] = {}
         """Agents that wait for a master, and their addresses."""
         self._spoken: set[socket.socket] = set()
@@ -87,8 +89,9 @@ class Relay:
             if listener.fileno() >= 0:
                 self._loop.unregister(listener.fileno())
                 listener.close()
-        for one in (*self._newcomers, *([self._master] if self._master else [])):
-            one.close()
+        for one in (*self._newcomers, self._master):
+            if one is not None:
+                one.close()
         for sock in list(self._waiting):
             self._dismiss(sock)
 
@@ -281,7 +284,7 @@ def _reason(error: ValueError | OSError, environment: Mapping[str, str]) -> str:
         return str(error)
     wanted = ", ".join(f"{name}={environment[name]}" for name in (_AGENTS_PORT, _MASTER_PORT))
     return (
-        f"it cannot listen ({wanted}): {str(error.strerror or error).lower()}. Choose ports that "
+        f"it cannot listen ({wanted}): {os.strerror(error.errno or 0).lower()}. Choose ports that "
         "no other program uses, and that this user may bind"
     )
 
