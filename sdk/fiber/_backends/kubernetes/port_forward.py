@@ -27,6 +27,9 @@ _DATA, _ERROR = 0, 1
 _MOST = 256 << 10
 """Bytes that one ``receive`` returns, at most."""
 
+_LONGEST = 16 << 20
+"""Bytes of a frame, at most.  An API server sends some thousands in one."""
+
 
 class PortForwardRequest(NamedTuple):
     """Request for a port-forward."""
@@ -216,6 +219,8 @@ class PortForward:
         return payload[1:]
 
     def _receive(self, size: int) -> bytes:
+        if (length := self._frames.length or 0) > _LONGEST:
+            raise ConnectionResetError(f"the API server sent a frame of {length} bytes")
         try:
             found: bytes = self._sock.recv(size)
         except (ssl.SSLWantReadError, ssl.SSLWantWriteError):
