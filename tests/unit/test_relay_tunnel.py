@@ -35,7 +35,7 @@ RUNNING = {"phase": "Running"}
 
 
 class Told(Notes):
-    """What a tunnel has called back."""
+    """Record of what a tunnel has called back."""
 
     def __init__(self) -> None:
         super().__init__()

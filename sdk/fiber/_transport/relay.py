@@ -71,7 +71,7 @@ class Relay:
         self._waiting: dict[socket.socket, str] = {}
         """Agents that wait for a master, and their addresses."""
         self._spoken: set[socket.socket] = set()
-        """Those of them that have sent something."""
+        """Waiting agents that have sent something."""
         self._listeners: list[socket.socket] = []
         try:
             self._listen(_agents_listener(agents_port), self._add_agent)
