@@ -356,8 +356,8 @@ def _on_pods() -> Iterator[Budget]:
 def _relayed() -> Iterator[Budget]:
     ours: Any = {"contender": "fiber-relay"}
     case = overhead.case_name(0.001, "chunksize 1")
-    what = "relay: overhead: "
-    yield Budget(what + case, "overhead", case, overhead.TIME.name, 1.03, **ours)
+    what = f"relay: overhead: {case}"
+    yield Budget(what, "overhead", case, overhead.TIME.name, 1.03, **ours)
     case = "map, chunksize 1"
     what = "relay: no-op tasks, chunksize 1"
     yield Budget(what, "throughput", case, throughput.RATE.name, 10, at_least=True, **ours)

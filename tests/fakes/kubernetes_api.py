@@ -18,6 +18,7 @@ from typing import Any
 from aiohttp import web
 
 from fakes import server_side_apply, strict
+from fakes.port_forward import PortForwards
 from fakes.store import KINDS, Body, Change, Failure, Place, Store, has_fields, line, matches
 
 BOOKMARK_SECONDS = 60.0
@@ -96,6 +97,7 @@ class KubernetesApi:
         """Values of Authorization that are let in; None: anybody."""
         self.allows: Callable[[Call], bool] = lambda call: True
         """Decision whether clients that send a token may make such a call; others may make all."""
+        self.forwards = PortForwards()
         self.port = 0
         self.server: Callable[[], asyncio.Protocol]
         """Makes the protocol of a connection, for clients that need no socket."""
@@ -173,6 +175,9 @@ class KubernetesApi:
     async def _carry_out(self, request: web.Request, call: Call) -> web.StreamResponse:
         body = json.loads(await request.read() or b"{}")
         try:
+            if call.subresource == "portforward":
+                self.store.get(call.plural, call.namespace or "", call.name)
+                return await self.forwards.serve(request)
             answer = web.json_response(self._perform(request, call, body))
         except Failure as failure:
             return _refused(failure)
