@@ -108,6 +108,7 @@ bench-operator: $(VENV)/.with-dev
 ## make bench-kubernetes  Fiber on pods beside multiprocessing, Ray and Dask (root, Go)
 bench-kubernetes: $(VENV)/.with-bench $(VENV)/.with-dev
 	PYTHONPATH=tests $(BIN)/python -m benchmarks.kubernetes_cluster
+	$(BIN)/python -m benchmarks.relay_memory
 
 ## make conformance   CPython's tests of multiprocessing and executors, joblib's (BACKEND=local, loopback or kubernetes)
 conformance: $(VENV)/.with-dev $(VENV)/.with-testsuite

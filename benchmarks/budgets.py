@@ -353,6 +353,21 @@ def _on_pods() -> Iterator[Budget]:
     )
 
 
+def _relayed() -> Iterator[Budget]:
+    ours: Any = {"contender": "fiber-relay"}
+    case = overhead.case_name(0.001, "chunksize 1")
+    what = f"relay: overhead: {case}"
+    yield Budget(what, "overhead", case, overhead.TIME.name, 1.03, **ours)
+    case = "map, chunksize 1"
+    what = "relay: no-op tasks, chunksize 1"
+    yield Budget(what, "throughput", case, throughput.RATE.name, 10, at_least=True, **ours)
+    what = "relay: latency of one apply, p50"
+    yield Budget(what, "latency", latency.NAME, latency.P50.name, 0.002, unit="s", **ours)
+    for case in ("1 MB arguments", "1 MB results"):  # 100 MB at 50 MB/s
+        what = f"relay: {case}, 100 of them"
+        yield Budget(what, "throughput", case, throughput.TIME.name, 2.0, unit="s", **ours)
+
+
 BUDGETS = (
     *_pool(),
     *_executors(),
@@ -365,4 +380,4 @@ BUDGETS = (
     *_endings(),
     *_large("fiber-loopback", "loopback: "),
 )
-ON_PODS = (*_on_pods(), *_large("fiber-kubernetes", ""))
+ON_PODS = (*_on_pods(), *_relayed(), *_large("fiber-kubernetes", ""))

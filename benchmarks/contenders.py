@@ -203,6 +203,15 @@ ON_PODS = Contender(
     "*",
     environment={"FIBER_BACKEND": "kubernetes"},
 )
+RELAYED = Contender(
+    "fiber-relay",
+    "Fiber, pods, relay",
+    ("fiber", "kubernetes"),
+    _POOL | VECTOR,
+    "#44AA99",
+    "*",
+    environment={"FIBER_BACKEND": "kubernetes", "FIBER_RELAY": "always"},
+)
 EXECUTOR_ON_PODS = Contender(
     "fiber-executor-kubernetes",
     "fiber.Executor, pods",
@@ -214,4 +223,4 @@ EXECUTOR_ON_PODS = Contender(
 )
 """Contenders that take part where a cluster is: see kubernetes_run.py."""
 
-BY_NAME = {contender.name: contender for contender in (*ALL, ON_PODS, EXECUTOR_ON_PODS)}
+BY_NAME = {contender.name: contender for contender in (*ALL, ON_PODS, RELAYED, EXECUTOR_ON_PODS)}

@@ -42,6 +42,7 @@ _OF_ONE_HOST = {
     "executors": (executors.SUBMIT, executors.MAP, executors.SLEEPING),
     "pipes": (pipes.environments(8),),
     "vector": (
+        vector.pixels(64),
         *(vector.cart_poles(count) for count in (8, 64)),
         *(vector.uneven(64, first_ready=first) for first in (False, True)),
     ),
@@ -52,8 +53,9 @@ Fiber with its processes in pods. It is compared with multiprocessing on the sam
 Ray's and Dask's clusters of as many workers, which are processes of it. Vector environments and
 executors are compared with Fiber's, Gymnasium's or concurrent.futures' on processes of this
 machine. The program runs outside the cluster. Each pod of Fiber has one worker, unless a section
-says otherwise. Every pod is on this machine: messages pass through Kubernetes' network and are
-encrypted, but travel no distance."""
+says otherwise. "Relay" is Fiber on pods that reach the program through a relay, the kubelet and the
+API server, as those of a program on a laptop do. Every pod is on this machine: messages pass
+through Kubernetes' network and are encrypted, but travel no distance."""
 
 
 def cases(size: float) -> list[Case]:

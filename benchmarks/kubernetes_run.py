@@ -21,6 +21,7 @@ from benchmarks.contenders import (
     EXECUTOR_ON_PODS,
     FIRST_READY,
     ON_PODS,
+    RELAYED,
     VECTOR,
     Contender,
 )
@@ -28,7 +29,7 @@ from benchmarks.model import Run
 from benchmarks.rounds import Rounds, say, scratch_folder
 from benchmarks.session import ROOT
 
-_OURS = (ON_PODS, EXECUTOR_ON_PODS)
+_OURS = (ON_PODS, RELAYED, EXECUTOR_ON_PODS)
 CONTENDERS = (
     *_OURS,
     replace(BY_NAME["fiber"], offers=VECTOR | FIRST_READY),

@@ -164,6 +164,7 @@ _ADAPTERS: dict[str, Callable[[Make, int, int, int], Any]] = {
     "fiber": _fiber,
     "fiber-loopback": _fiber,
     "fiber-kubernetes": _fiber,
+    "fiber-relay": _fiber,
     "async-vector-env": _async,
     "sync-vector-env": _sync,
     "stable-baselines3": _SubprocVecEnv,

@@ -18,6 +18,7 @@ POLICY = "ValidatingAdmissionPolicy"
 CREATED: Body = {"admissionPolicy": {"create": True}}
 TEMPLATE = of_pod(containers=[{"name": "worker", "image": "fiber-worker"}])
 PASSED_ON = {
+    "another account",
     "a priority class of the system",
     "a type of SELinux",
     "a user of SELinux",
@@ -25,7 +26,8 @@ PASSED_ON = {
     "nodes with any taint of one effect",
     "the control plane",
 }
-"""Cases that the relay shares, because they say where and as whom a pod may run."""
+"""Cases that the relay shares, because they say where and as whom a pod may run.  Of an account it
+gets the pull secrets, and no token."""
 ALICE = "alice"
 LAB = "system:serviceaccount:lab:"
 

@@ -58,6 +58,13 @@ def test_a_program_has_exactly_the_rights_for_the_sdks_calls(roles: list[Manifes
     assert rights == FIBER_USER
 
 
+def test_a_person_who_runs_programs_gets_jobs_and_logs_beside_them(roles: list[Manifest]) -> None:
+    rights: dict[str, set[str]] = {}
+    for _, resource, verb in allowed(named(roles, "ClusterRole", "fiber-runner")):
+        rights.setdefault(resource, set()).add(verb)
+    assert rights == {"jobs": {"create", "delete", "get", "list"}, "pods/log": {"get"}}
+
+
 def test_the_test_touches_its_own_pool_alone(roles: list[Manifest]) -> None:
     rules = named(roles, "Role", "fiber-fiber-operator-test")["rules"]
     free = [rule["verbs"] for rule in rules if "resourceNames" not in rule]

@@ -23,6 +23,17 @@ def may_use_pools(scene: Scene) -> None:
     scene.kube.create(scene.path("rolebindings"), binding)
 
 
+def may_run_programs(scene: Scene) -> None:
+    """Give the namespace's account the role fiber-runner, too."""
+    binding = scene.kube.call("GET", scene.path("rolebindings", ACCOUNT))
+    other = {
+        "metadata": {"name": f"{ACCOUNT}-runs-programs"},
+        "roleRef": {**binding["roleRef"], "name": "fiber-runner"},
+        "subjects": binding["subjects"],
+    }
+    scene.kube.create(scene.path("rolebindings"), other)
+
+
 def may_not(scene: Scene, resource: str) -> None:
     """Take the rights to a resource from the namespace's account."""
     group = "rbac.authorization.k8s.io"

@@ -77,3 +77,10 @@ def test_an_interrupt_leaves_no_processes_or_files(tmp_path: Path, scratch: Path
     assert not any(os.path.exists(f"/proc/{pid}") for pid in below)
     assert not list(tmp_path.iterdir())
     assert not list(scratch.iterdir())
+
+
+def test_the_memory_of_a_relay_is_measured() -> None:
+    measure = [sys.executable, "-m", "benchmarks.relay_memory", "--agents", "3"]
+    done = subprocess.run(measure, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE)
+    assert "3 agents" in done.stdout, done.stderr
+    assert "relay: " in done.stdout

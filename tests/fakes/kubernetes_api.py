@@ -18,6 +18,7 @@ from typing import Any
 from aiohttp import web
 
 from fakes import server_side_apply, strict
+from fakes.port_forward import PortForwards
 from fakes.store import KINDS, Body, Change, Failure, Place, Store, has_fields, line, matches
 
 BOOKMARK_SECONDS = 60.0
@@ -100,6 +101,7 @@ class KubernetesApi:
         """Answers by path, in place of those below; None: the path is not served."""
         self.date: str | None = None
         """Header ``Date`` of these answers; None: the time of this machine."""
+        self.forwards = PortForwards()
         self.port = 0
         self.server: Callable[[], asyncio.Protocol]
         """Makes the protocol of a connection, for clients that need no socket."""
@@ -190,6 +192,9 @@ class KubernetesApi:
     async def _carry_out(self, request: web.Request, call: Call) -> web.StreamResponse:
         body = json.loads(await request.read() or b"{}")
         try:
+            if call.subresource == "portforward":
+                self.store.get(call.plural, call.namespace or "", call.name)
+                return await self.forwards.serve(request)
             answer = web.json_response(self._perform(request, call, body))
         except Failure as failure:
             return _refused(failure)

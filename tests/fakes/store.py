@@ -27,6 +27,7 @@ KINDS = {
     "nodes": ("v1", "Node"),
     "resourcequotas": ("v1", "ResourceQuota"),
     "limitranges": ("v1", "LimitRange"),
+    "serviceaccounts": ("v1", "ServiceAccount"),
     "endpointslices": ("discovery.k8s.io/v1", "EndpointSlice"),
     "deployments": ("apps/v1", "Deployment"),
     "poddisruptionbudgets": ("policy/v1", "PodDisruptionBudget"),

@@ -36,7 +36,7 @@ from benchmarks import (  # noqa: E402
 )
 from benchmarks.agent_host import Order  # noqa: E402
 from benchmarks.contender import Bench  # noqa: E402
-from benchmarks.contenders import ALL, BY_NAME, ON_PODS, Contender  # noqa: E402
+from benchmarks.contenders import ALL, BY_NAME, ON_PODS, RELAYED, Contender  # noqa: E402
 from benchmarks.environment import cart_pole  # noqa: E402
 from benchmarks.fake_agents import FakeAgent, TaskRunner  # noqa: E402
 from benchmarks.model import Case, Metric, Run  # noqa: E402
@@ -59,7 +59,7 @@ def test_each_case_has_a_unique_name_and_contenders_with_adapters() -> None:
         assert len(able & {ON_PODS.name, "fiber-executor-kubernetes"}) == 1, case.name
         assert case.baseline in able, case.name
     vectors = {"vector steps", "cart poles", "first ready"}
-    offering = {each.name for each in (*ALL, ON_PODS) if each.offers & vectors}
+    offering = {each.name for each in (*ALL, ON_PODS, RELAYED) if each.offers & vectors}
     assert offering == set(vector_peers._ADAPTERS)
     started = {each.name for each in ALL if each.offers & {"executor", "parallel"}}
     assert started <= set(peers._ADAPTERS)

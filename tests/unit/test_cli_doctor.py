@@ -16,7 +16,13 @@ from fakes.served import served
 from fiber import config
 from fiber._backends.kubernetes.template import fiber_pool_body
 from fiber._cli import doctor
-from fiber._cli.doctor_rights import PROGRAM_RIGHTS, RUN_RIGHTS, SPEC_OF_PROGRAMS, Right
+from fiber._cli.doctor_rights import (
+    PROGRAM_RIGHTS,
+    RUN_RIGHTS,
+    RUNNER_RIGHTS,
+    SPEC_OF_PROGRAMS,
+    Right,
+)
 from fiber_api import names
 from unit.doctor_mistakes import ANSWER, MISTAKES, DoctorRig, Mistake
 from unit.kubernetes_rig import NAMESPACE, OTHER, Body, kubeconfig, pool_body
@@ -94,7 +100,8 @@ def test_an_account_that_sees_only_its_namespace_has_no_fault(rig: DoctorRig) ->
     rig.cluster.api.allows = lambda call: call.namespace == NAMESPACE and call.plural not in hidden
     found = verdicts()
     unknown = {verdict["check"] for verdict in found if verdict["state"] == "unknown"}
-    assert unknown == {"namespace", "operator", "operator's version", "quota", "nodes"}
+    where = {"namespace", "operator", "operator's version", "quota", "nodes"}
+    assert unknown == where
     assert rig.trials == 1
 
 
@@ -161,13 +168,14 @@ def test_a_missing_right_is_named(rig: DoctorRig, right: Right) -> None:
     assert rig.trials == bool(right.only)
 
 
-@pytest.mark.parametrize("right", sorted({*RUN_RIGHTS} - {*PROGRAM_RIGHTS}), ids=str)
+@pytest.mark.parametrize("right", RUN_RIGHTS, ids=str)
 def test_a_missing_right_of_run_is_named(rig: DoctorRig, right: Right) -> None:
     rig.cluster.forbid(right.verb, right.resource)
     found = [verdict for verdict in verdicts() if verdict["state"] == "fault"]
-    assert {verdict["check"] for verdict in found} <= {"special rights", "rights of fiber run"}
+    assert {"rights", "special rights", "rights of fiber run"} >= {each["check"] for each in found}
+    assert found[-1]["check"] == "rights of fiber run"
     assert found[-1]["what"] == f"this account may not {right}"
-    assert rig.trials == 1
+    assert "fiber-runner" in found[-1]["do"]
 
 
 def by_resource(rights: tuple[Right, ...]) -> dict[str, set[str]]:
@@ -177,22 +185,31 @@ def by_resource(rights: tuple[Right, ...]) -> dict[str, set[str]]:
     return found
 
 
-def test_the_rights_of_a_program_are_those_of_the_chart() -> None:
+def rights_in_chart(role: str) -> set[tuple[str, str, str]]:
     rules = (ROOT / "charts/fiber-operator/templates/_rules.tpl").read_text()
-    text = re.search(r"^user:\n(.*?)^\w", rules, re.MULTILINE | re.DOTALL)
+    text = re.search(rf"^{role}:\n(.*?)^\w", rules, re.MULTILINE | re.DOTALL)
     assert text is not None
-    given = {
+    return {
         (group, resource, verb)
         for rule in yaml.safe_load(text[1])
         for group in rule["apiGroups"]
         for resource in rule["resources"]
         for verb in rule["verbs"]
     }
-    wanted = {(right.group, right.resource, right.verb) for right in PROGRAM_RIGHTS}
-    # The role may also have rights for `fiber run`.
-    runs = {(right.group, right.resource, right.verb) for right in RUN_RIGHTS}
-    assert wanted <= given <= wanted | runs
-    assert by_resource(PROGRAM_RIGHTS).items() <= FIBER_USER.items()
+
+
+@pytest.mark.parametrize(("role", "rights"), [("user", PROGRAM_RIGHTS), ("runner", RUNNER_RIGHTS)])
+def test_the_rights_are_those_of_the_charts_role(role: str, rights: tuple[Right, ...]) -> None:
+    wanted = {(right.group, right.resource, right.verb) for right in rights}
+    assert wanted == rights_in_chart(role)
+
+
+def test_both_roles_are_enough_for_fiber_run() -> None:
+    assert {*RUN_RIGHTS} <= {right._replace(only="") for right in (*PROGRAM_RIGHTS, *RUNNER_RIGHTS)}
+
+
+def test_the_rights_of_the_fake_account_are_those_of_programs() -> None:
+    assert by_resource(PROGRAM_RIGHTS) == FIBER_USER
 
 
 # ---- facts

@@ -7,6 +7,7 @@ calls that the operator makes, both ways.
   serving  the operator, where it shows that it serves: in each namespace that it watches, or in kube-public for all
   anyone   all accounts, in kube-public: to see whether an operator serves all namespaces
   user     programs that are masters: exactly the calls of the SDK
+  runner   people who start programs in pods by `fiber run`, in addition to user
   viewer   people who only look
   smoke    the helm test
 */}}
@@ -96,6 +97,14 @@ user:
   # Whether workers on other nodes can mount the claims of that pod.
   - apiGroups: [""]
     resources: [persistentvolumeclaims]
+    verbs: [get]
+runner:
+  # Not for programs: who may make Jobs runs pods as any account of the namespace.
+  - apiGroups: [batch]
+    resources: [jobs]
+    verbs: [create, delete, get, list]
+  - apiGroups: [""]
+    resources: [pods/log]
     verbs: [get]
 viewer:
   - apiGroups: [fiber.dev]

@@ -11,9 +11,11 @@ import fiber
 from fiber._cli.doctor_capacity import refusing_quota, refusing_range, requests_of, room
 from fiber._cli.doctor_facts import Answer, Facts, FirstAnswer, NoPlace, Place
 from fiber._cli.doctor_rights import (
+    ACCOUNT_RIGHTS,
     PROGRAM_RIGHTS,
     ROLE,
     RUN_RIGHTS,
+    RUNNER_ROLE,
     SCHEMA_NAME,
     SPEC_OF_PROGRAMS,
     Right,
@@ -23,7 +25,7 @@ from fiber._cli.pool_access import account_of_program, condition, is_of_program,
 from fiber.config import Config
 from fiber.errors import ConfigError
 from fiber.resources import GPU
-from fiber_api.names import SERVING_LEASE, ConditionType
+from fiber_api.names import PROGRAM_ACCOUNT, SERVING_LEASE, ConditionType
 from fiber_api.rest import ApiError, Body, Forbidden, NotFound, NotServed, Unauthorized
 from fiber_api.times import format_time, parse_time
 
@@ -323,15 +325,34 @@ def _rights(facts: Facts, wanted: Sequence[Right], who: str) -> Iterator[Verdict
 
 
 def _remedy(namespace: str, wanted: Sequence[Right]) -> str:
-    if wanted is RUN_RIGHTS:
-        return (
-            f"ask an administrator for these rights in the namespace {namespace!r}: a Role with "
-            "them, and a RoleBinding"
-        )
+    roles = f"{ROLE} and {RUNNER_ROLE}" if wanted is RUN_RIGHTS else ROLE
+    role = RUNNER_ROLE if wanted is RUN_RIGHTS else ROLE
     return (
-        f"ask an administrator for the role {ROLE}: `kubectl create rolebinding NAME "
-        f"--namespace {namespace} --clusterrole {ROLE} --user YOU`"
+        f"ask an administrator for the role {roles}: `kubectl create rolebinding NAME "
+        f"--namespace {namespace} --clusterrole {role} --user YOU`"
     )
+
+
+def _account(facts: Facts) -> Iterator[Verdict]:
+    assert isinstance(facts.place, Place)
+    name, namespace = PROGRAM_ACCOUNT, facts.place.namespace
+    rights = facts.rights if isinstance(facts.rights, Mapping) else {}
+    missing = [str(right) for right in ACCOUNT_RIGHTS if not rights.get(right, True)]
+    match facts.account:
+        case NotFound() if missing:
+            yield fault(
+                f"there is no account {name!r}, as which `fiber run` runs programs",
+                f"this account may not make it: it may not {', nor '.join(missing)}",
+                f"ask an administrator: `kubectl create serviceaccount {name} -n {namespace}` and "
+                f"`kubectl create rolebinding {name} --clusterrole {ROLE} --serviceaccount "
+                f"{namespace}:{name} -n {namespace}`; or use `fiber run --service-account`",
+            )
+        case NotFound():
+            yield ok(f"the first `fiber run` makes {name!r}")
+        case ApiError() as error:
+            yield unknown(f"cannot see whether {name!r} exists: {_short(error.message)}")
+        case _:
+            yield ok(f"{name!r} exists")
 
 
 # ---- pods -----------------------------------------------------------------------------------
@@ -474,6 +495,7 @@ CHECKS = (
     Check("rights", _program_rights, ("kubeconfig", "API server"), blocks=True),
     Check("special rights", _special_rights, ("kubeconfig", "API server")),
     Check("rights of fiber run", _run_rights, ("kubeconfig", "API server")),
+    Check("account of fiber run", _account, ("kubeconfig", "API server", "namespace")),
     Check("image", _image, ("kubeconfig",), blocks=True),
     Check("quota", _quota, ("kubeconfig", "API server", "namespace", "image")),
     Check("nodes", _nodes, ("kubeconfig", "API server", "image")),

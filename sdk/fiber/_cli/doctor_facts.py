@@ -19,11 +19,19 @@ from typing import Any, NamedTuple
 from fiber import config
 from fiber._backends.kubernetes.api import Api, ApiRequest, ApiSession, Login, network_errors
 from fiber._backends.kubernetes.template import PodShape, own_container, pod_template
-from fiber._cli.doctor_rights import PROGRAM_RIGHTS, REVIEWS, RUN_RIGHTS, SCHEMA, Right
+from fiber._cli.doctor_rights import (
+    ACCOUNT_RIGHTS,
+    PROGRAM_RIGHTS,
+    REVIEWS,
+    RUN_RIGHTS,
+    SCHEMA,
+    Right,
+)
 from fiber.config import Config
 from fiber.errors import ConfigError
 from fiber_api import names
 from fiber_api.rest import (
+    ACCOUNTS,
     DEPLOYMENTS,
     LEASES,
     NODES,
@@ -111,6 +119,8 @@ class Facts:
     """Leases by which operators show that they serve, by namespace."""
     operators: Answer | None = None
     rights: Mapping[Right, bool] | ApiError | None = None
+    account: Answer | None = None
+    """Account of the programs of ``fiber run``."""
     quotas: Answer | None = None
     limits: Answer | None = None
     nodes: Answer | None = None
@@ -223,6 +233,7 @@ class Gatherer:
             "resources": (f"/apis/{names.API_VERSION}", {}),
             "schema": (SCHEMA, {}),
             "operators": (DEPLOYMENTS.path(), {"labelSelector": _OPERATORS}),
+            "account": (ACCOUNTS.path(namespace, names.PROGRAM_ACCOUNT), {}),
             "quotas": (QUOTAS.path(namespace), {}),
             "limits": (LIMITS.path(namespace), {}),
             "nodes": (NODES.path(), {}),
@@ -281,7 +292,7 @@ def _answered(call: Callable[[], Body]) -> Answer:
 
 
 def _rights(api: Api, namespace: str, pool: ThreadPoolExecutor) -> dict[Right, bool] | ApiError:
-    wanted = list(dict.fromkeys((*PROGRAM_RIGHTS, *RUN_RIGHTS)))
+    wanted = list(dict.fromkeys((*PROGRAM_RIGHTS, *RUN_RIGHTS, *ACCOUNT_RIGHTS)))
 
     def has(right: Right) -> Any:
         review = right.review(namespace)

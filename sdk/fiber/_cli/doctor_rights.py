@@ -72,17 +72,26 @@ PROGRAM_RIGHTS = (
 )
 """Rights of the chart's role fiber-user."""
 
-RUN_RIGHTS = (
+RUNNER_RIGHTS = (
     *_all("create delete get list", JOBS),
-    *_all("get list watch", PODS),
     *_all("get", PODS, "log"),
+)
+"""Rights of the chart's role fiber-runner, for people who use ``fiber run``."""
+
+RUN_RIGHTS = (
+    *RUNNER_RIGHTS,
+    *_all("get list", PODS),
     *_all("create get", PODS, "portforward"),
-    *_all("get create", ACCOUNTS, only="the first `fiber run` in a namespace"),
-    *_all("create", ROLE_BINDINGS, only="the first `fiber run` in a namespace"),
 )
 """Rights of ``fiber run``, ``fiber logs`` and ``fiber stop``."""
 
-ROLE = "fiber-user"
+ACCOUNT_RIGHTS = (
+    *_all("create", ACCOUNTS),
+    *_all("create", ROLE_BINDINGS),
+)
+"""Rights of the first ``fiber run`` in a namespace, which makes the account of programs."""
+
+ROLE, RUNNER_ROLE = "fiber-user", "fiber-runner"
 
 REVIEWS = "/apis/authorization.k8s.io/v1/selfsubjectaccessreviews"
 

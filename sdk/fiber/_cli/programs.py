@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 from fiber._backends.kubernetes.problems import pod_end
-from fiber._backends.kubernetes.relay_tunnel import state_of
+from fiber._backends.kubernetes.relay_client import state_of
 from fiber._cli.failures import CommandError, explained, not_found
 from fiber._cli.forward import open_socket
 from fiber._cli.session import Session

@@ -7,7 +7,11 @@ A ``Multiplexer`` moves bytes between these sockets and its ``Carrier``, and can
 Memory is bounded.  The multiplexer reads a socket only while the stream has credit and the carrier
 has little left to send.  For the other direction it grants each stream ``FIRST_CREDIT`` bytes.  It
 grants more to streams whose socket takes the bytes at once, up to ``_LARGEST_WINDOW`` each and
-``_SPARE`` for all together, and takes that back from streams whose socket is slow.
+``_SPARE`` for all together, and takes that back from streams whose socket is slow.  A peer that
+makes the multiplexer answer, and does not read the answers, is cut off.
+
+END closes one direction.  If the program at a socket has closed it wholly, ABORT follows END: then
+the other side delivers what it has, and closes its socket too.
 """
 
 from __future__ import annotations
@@ -30,6 +34,13 @@ _SPARE = 64 << 20
 
 _FULL = 256 << 10
 """Bytes that the carrier has left to send, above which no socket is read."""
+
+_UNREAD = 1 << 20
+"""Bytes that the carrier has left to send, above which the other side counts as broken.  The bytes
+of streams fill a quarter of it; the rest is for short frames."""
+
+_LINGER = 10.0
+"""Seconds for a socket to take the last bytes of a stream that the other side has closed."""
 
 _PING_AFTER, _DEAD_AFTER = 3.0, 12.0
 """Seconds of silence until a PING, and until the connection counts as dead."""
@@ -118,6 +129,7 @@ class _Stream:
     """Stream with its socket."""
 
     __slots__ = (
+        "closed",
         "credit",
         "ended",
         "held",
@@ -139,7 +151,7 @@ class _Stream:
         """Bytes that the other side may have sent and the socket has not taken."""
         self.taken = 0
         """Bytes that the socket took and for which no credit was granted yet."""
-        self.incoming: deque[memoryview] = deque()
+        self.incoming = bytearray()
         """Bytes that the socket has not taken."""
         self.held = False
         """True while the socket is not read."""
@@ -149,6 +161,8 @@ class _Stream:
         """True once the socket has reached its end."""
         self.peer_ended = False
         """True once the other side has sent END."""
+        self.closed = False
+        """True once the other side has sent ABORT after END."""
 
 
 class Multiplexer:
@@ -177,8 +191,10 @@ class Multiplexer:
         self._streams: dict[int, _Stream] = {}
         self._numbers = 0
         self._spare = _SPARE
-        self._held: list[_Stream] = []
+        self._held: dict[_Stream, None] = {}
         """Streams that have bytes and wait until the carrier has sent its backlog."""
+        self._reads_on = False
+        """True while a call that reads the carrier is scheduled."""
         self._heard = loop.now()
         self._timer: LoopTimer | None = loop.call_later(_PING_AFTER, self._check_silence)
         self._writes = False
@@ -203,9 +219,14 @@ class Multiplexer:
             self._loop.call_soon(self._break, _words(error))
             return
         self._watch_writes()
+        if self._carrier.backlog > _UNREAD:
+            self._loop.call_soon(self._break, "the other side does not read what it is sent")
 
     def open(self, sock: socket.socket, origin: str) -> None:
         """Open a stream for ``sock``, a connection from ``origin``."""
+        if self.is_over():
+            sock.close()
+            return
         self._numbers += 1
         self.send(StreamFrame(Kind.OPEN, self._numbers, origin.encode()))
         self._add(self._numbers, sock)
@@ -253,7 +274,7 @@ class Multiplexer:
             return
         self._watch_writes()
         if self._carrier.backlog <= _FULL // 2:
-            held, self._held = self._held, []
+            held, self._held = self._held, {}
             for stream in held:
                 self._resume(stream)
 
@@ -268,9 +289,7 @@ class Multiplexer:
                     self._take(frame)
                     if self.is_over():
                         return
-                # Later: the sockets get their turn.  The descriptor need not become readable
-                # again, since TLS may have read more.
-                self._loop.call_soon(self._read_carrier)
+                self._read_on()
         except OSError as error:
             self._break(_words(error))
         except ProtocolError as error:
@@ -279,47 +298,65 @@ class Multiplexer:
             if piece == b"":
                 self._break("it was closed by the other side")
 
+    def _read_on(self) -> None:
+        """Read the carrier again, after the sockets have had their turn.
+
+        The descriptor need not become readable again, since TLS may have read more.
+        """
+        if not self._reads_on:
+            self._reads_on = True
+            self._loop.call_soon(self._read_again)
+
+    def _read_again(self) -> None:
+        self._reads_on = False
+        self._read_carrier()
+
     def _take(self, frame: StreamFrame) -> None:
-        if frame.kind is Kind.DATA:
-            self._take_data(frame)
-        elif frame.kind is Kind.CREDIT:
-            if (stream := self._streams.get(frame.stream)) is not None:
-                stream.credit += frame.credit
-                self._resume(stream)
-        elif frame.kind is Kind.OPEN:
-            self._take_open(frame)
-        elif frame.kind is Kind.END:
-            if (stream := self._streams.get(frame.stream)) is not None:
-                stream.peer_ended = True
-                self._write_socket(stream)
-        elif frame.kind is Kind.ABORT:
-            if (stream := self._streams.get(frame.stream)) is not None:
-                self._remove(stream)
-        elif frame.kind is Kind.PING:
+        if frame.kind is Kind.PING:
             self.send(StreamFrame(Kind.PONG))
         elif frame.kind is Kind.HELLO:
             self._on_hello(frame)
+        elif frame.kind is Kind.OPEN:
+            self._take_open(frame)
+        elif (stream := self._streams.get(frame.stream)) is None:
+            return  # it ended here while this frame was on its way
+        elif frame.kind is Kind.DATA:
+            self._take_data(stream, frame.payload)
+        elif frame.kind is Kind.CREDIT:
+            stream.credit += frame.credit
+            self._resume(stream)
+        elif frame.kind is Kind.END:
+            stream.peer_ended = True
+            self._write_socket(stream)
+        elif frame.kind is Kind.ABORT:
+            self._take_abort(stream)
 
     def _take_open(self, frame: StreamFrame) -> None:
         if self._on_open is None or frame.stream in self._streams:
             raise ProtocolError(f"the stream {frame.stream} cannot be opened")
         try:
-            sock = self._on_open(frame.payload.decode(errors="replace"))
+            sock = self._on_open(frame.origin)
         except OSError:  # no descriptor is free; the agent dials again
             self.send(StreamFrame(Kind.ABORT, frame.stream))
             return
         self._add(frame.stream, sock)
 
-    def _take_data(self, frame: StreamFrame) -> None:
-        stream = self._streams.get(frame.stream)
-        if stream is None:
-            return  # it was aborted here while these bytes were on their way
-        waiting = sum(map(len, stream.incoming)) + stream.taken + len(frame.payload)
-        if waiting > stream.window:
+    def _take_data(self, stream: _Stream, data: bytes) -> None:
+        if len(stream.incoming) + stream.taken + len(data) > stream.window:
             raise ProtocolError("a stream has sent more than its credit")
-        stream.incoming.append(memoryview(frame.payload))
-        if len(stream.incoming) == 1:
+        if stream.peer_ended:
+            raise ProtocolError("a stream has sent bytes after its end")
+        waited = bool(stream.incoming)
+        stream.incoming += data
+        if not waited:
             self._write_socket(stream)
+
+    def _take_abort(self, stream: _Stream) -> None:
+        if not stream.peer_ended or not stream.incoming:
+            self._remove(stream)
+        elif not stream.closed:
+            stream.closed = True
+            self._loop.call_later(_LINGER, self._remove, stream)
 
     # -- The sockets
 
@@ -328,14 +365,19 @@ class Multiplexer:
         self._streams[number] = stream = _Stream(number, sock)
         self._loop.register(sock.fileno(), lambda: self._read_socket(stream))
 
+    def _is_open(self, stream: _Stream) -> bool:
+        return self._streams.get(stream.number) is stream
+
     def _remove(self, stream: _Stream) -> None:
-        if self._streams.pop(stream.number, None) is not None:
+        if self._is_open(stream):
+            del self._streams[stream.number]
+            self._held.pop(stream, None)
             self._spare += stream.window - FIRST_CREDIT
             self._loop.unregister(stream.sock.fileno())
             stream.sock.close()
 
     def _abort(self, stream: _Stream) -> None:
-        if stream.number in self._streams:
+        if self._is_open(stream):
             self.send(StreamFrame(Kind.ABORT, stream.number))
             self._remove(stream)
 
@@ -351,7 +393,7 @@ class Multiplexer:
             self._loop.unregister(stream.sock.fileno())
 
     def _resume(self, stream: _Stream) -> None:
-        if stream.held and stream.credit and not stream.ended and stream.number in self._streams:
+        if stream.held and stream.credit and not stream.ended and self._is_open(stream):
             stream.held = False
             if stream.parked:
                 stream.parked = False
@@ -361,14 +403,18 @@ class Multiplexer:
 
     def _read_socket(self, stream: _Stream) -> None:
         if stream.held:
-            self._park(stream)
+            # Nobody waits for bytes, so the socket's peer has closed it wholly.
+            if stream.ended:
+                self._abort(stream)
+            else:
+                self._park(stream)
             return
-        if stream.ended or not stream.credit:
+        if not stream.credit or stream.closed:
             self._hold(stream)
             return
         if self._carrier.backlog > _FULL:
             self._hold(stream)
-            self._held.append(stream)
+            self._held[stream] = None
             return
         try:
             data = receive(stream.sock, min(stream.credit, MOST_DATA))
@@ -389,15 +435,14 @@ class Multiplexer:
     def _write_socket(self, stream: _Stream) -> None:
         try:
             while stream.incoming:
-                sent = send(stream.sock, stream.incoming[0])
-                stream.taken += sent
-                if sent < len(stream.incoming[0]):
-                    stream.incoming[0] = stream.incoming[0][sent:]
+                with memoryview(stream.incoming) as waiting:
+                    sent = send(stream.sock, waiting)
+                if not sent:
                     break
-                stream.incoming.popleft()
-            else:
-                if stream.peer_ended:
-                    stream.sock.shutdown(socket.SHUT_WR)
+                del stream.incoming[:sent]
+                stream.taken += sent
+            if stream.peer_ended and not stream.incoming:
+                stream.sock.shutdown(socket.SHUT_WR)
         except OSError:
             self._abort(stream)
             return
@@ -426,7 +471,7 @@ class Multiplexer:
             self.send(credit(stream.number, granted))
 
     def _remove_if_over(self, stream: _Stream) -> None:
-        if stream.ended and stream.peer_ended and not stream.incoming:
+        if (stream.ended or stream.closed) and stream.peer_ended and not stream.incoming:
             self._remove(stream)
 
 

@@ -15,7 +15,7 @@ OPEN     any     address of the agent, ``host:port``
 DATA     any     bytes of the stream, at most ``MOST_DATA``
 CREDIT   any     4 bytes: how many more bytes of this stream may be sent
 END      any     none: the sender sends no more bytes, and still receives
-ABORT    any     none: the stream is broken
+ABORT    any     none: the stream is broken; after END, it is closed
 PING     0       none
 PONG     0       none
 =======  ======  ===========================================================
@@ -44,6 +44,7 @@ MOST_DATA = 64 << 10
 _HEAD = struct.Struct(">BII")
 _COUNT = struct.Struct(">I")
 _MOST_CREDIT = 1 << 30
+_MOST_ORIGIN = 100
 
 
 class Kind(enum.IntEnum):
@@ -81,11 +82,19 @@ class StreamFrame(NamedTuple):
         return int(count)
 
     @property
+    def origin(self) -> str:
+        """Address in an OPEN frame.  It is fit to be printed."""
+        found = self.payload.decode(errors="replace")
+        if not found.isascii() or not found.isprintable() or len(found) > _MOST_ORIGIN:
+            raise ProtocolError("an OPEN frame has no address")
+        return found
+
+    @property
     def hello(self) -> dict[str, Any]:
         """Content of a HELLO frame."""
         try:
             found = json.loads(self.payload)
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise ProtocolError("a HELLO frame is no JSON") from error
         if not isinstance(found, dict) or found.get("version") != VERSION:
             raise ProtocolError(

@@ -21,7 +21,11 @@ from collections.abc import Iterator, Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict, Unpack
 
-from fiber._backends.kubernetes.port_forward import PortForward, PortForwardRequest
+from fiber._backends.kubernetes.port_forward import (
+    PortForward,
+    PortForwardRequest,
+    proxy_options,
+)
 from fiber.errors import ConfigError
 from fiber_api import names
 from fiber_api.rest import (
@@ -363,20 +367,12 @@ class ApiSession:
     def _port_forward_by(self, client: ApiClient, request: ApiRequest) -> PortForward:
         _, url, headers = self._serialize(client, request)
         configuration = client.configuration
-        proxy: dict[str, Any] = {}
-        if configuration.proxy:
-            parts = urllib.parse.urlsplit(configuration.proxy)
-            proxy = {
-                "http_proxy_host": parts.hostname,
-                "http_proxy_port": parts.port,
-                "proxy_type": "http",
-            }
         return PortForwardRequest(
             url.replace("http", "ws", 1),
             {name.lower(): value for name, value in headers.items()}.get("authorization"),
             client.rest_client.pool_manager.connection_pool_kw["ssl_context"],
             configuration.tls_server_name,
-            proxy,
+            proxy_options(configuration.proxy, configuration.no_proxy),
         ).connect(CONNECT_TIMEOUT)
 
     def _send_by(

@@ -22,7 +22,7 @@ from fiber._backends.kubernetes.attached_pool import LOST, AttachedPool
 from fiber._backends.kubernetes.fiber_pool import FiberPoolClient
 from fiber._backends.kubernetes.problems import AgentRoute, PoolName, node_of, pod_end
 from fiber._backends.kubernetes.provisioner import ListenerObserver, PoolProvisioner, PreparedPool
-from fiber._backends.kubernetes.relay_tunnel import RelayedPool, RelayTunnel
+from fiber._backends.kubernetes.relay_client import RelayClient, RelayedPool
 from fiber._backends.kubernetes.template import PodShape
 from fiber._backends.kubernetes.waiting import Preparation, WaitingChildren
 from fiber._backends.remote import RemoteAgent, RemoteChild
@@ -160,7 +160,7 @@ class Pods:
             on_unreached=None if config.relay == "never" else self._use_relay,
         )
         self._attached: AttachedPool | None = None
-        self._tunnel: RelayTunnel | None = None
+        self._relay: RelayClient | None = None
         self.over = False
         """True once the pool has failed or ended, and was deleted or detached from."""
         self._goes_on = False
@@ -197,8 +197,8 @@ class Pods:
         if self._prepared is not None:
             listener = self._prepared.listener
             self._wait_for(lambda then: listener.close("the master ended", then=then))
-        if self._tunnel is not None:
-            self._tunnel.close()
+        if self._relay is not None:
+            self._relay.close()
 
     def _wait_for(self, ask: Callable[[Callable[[], None]], None]) -> None:
         """Call ``ask`` with a callback, and wait for the callback, unless the loop is broken."""
@@ -389,7 +389,7 @@ class Pods:
             route = AgentRoute(prepared.address, prepared.attachment.displaced)
         self._waiting.on_attached(route)
         if pool.relay:
-            self._open_tunnel(pool)
+            self._connect_to_relay(pool)
 
     # -- Relay
 
@@ -406,21 +406,21 @@ class Pods:
         )
         self._note_unreached()
         client.ask_for_relay(pool)
-        self._open_tunnel(pool)
+        self._connect_to_relay(pool)
 
-    def _open_tunnel(self, pool: AttachedPool) -> None:
-        if self._prepared is None or self._closing.is_set() or self._tunnel is not None:
+    def _connect_to_relay(self, pool: AttachedPool) -> None:
+        if self._prepared is None or self._closing.is_set() or self._relay is not None:
             return
         listener = self._prepared.listener
         listener.be_patient(RELAY_LOST_AFTER)
-        self._tunnel = RelayTunnel(
+        self._relay = RelayClient(
             self._api,
             RelayedPool(pool.name, pool.namespace, pool.uid, pool.master.identity, pool.epoch),
             take=listener.take,
             on_trouble=partial(self._loop.call_soon, self._on_relay_trouble),
             on_refused=partial(self._loop.call_soon, self._on_relay_refused),
         )
-        self._tunnel.start()
+        self._relay.start()
         self._waiting.use_relay(names.relay_name(pool.name))
 
     def _on_relay_trouble(self, trouble: str) -> None:
@@ -472,8 +472,8 @@ class Pods:
 
     def _end(self) -> None:
         self.over = True
-        if self._tunnel is not None:
-            self._tunnel.begin_close()
+        if self._relay is not None:
+            self._relay.begin_close()
         for agent in list(self.agents.agents.values()):
             agent.lose(_NOT_OURS)
         if self._successor is not None and self._goes_on:

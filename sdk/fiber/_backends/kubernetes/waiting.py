@@ -71,7 +71,7 @@ class WaitingChildren:
         self._timeout_timer: ScheduledCall | None = None
         self._on_unreached = on_unreached
         self._relay_trouble: str | None = None
-        """Reason why there is no tunnel to the relay; None if no relay is used or it works."""
+        """Reason why the relay cannot be used now; None if no relay is used or it works."""
         self._reachability = ReachabilityProbe(
             DOUBTED_AFTER if on_unreached is None else RELAYED_AFTER
         )
@@ -119,7 +119,7 @@ class WaitingChildren:
         self._judge_anew()
 
     def on_relay_trouble(self, trouble: str) -> None:
-        """Take the reason why there is no tunnel to the relay; empty if there is one."""
+        """Take the reason why the relay cannot be used now; empty if it can."""
         self._relay_trouble = trouble or None
         if not trouble:
             self._judge_anew()
@@ -194,7 +194,7 @@ class WaitingChildren:
     def _judge_reachability(self) -> None:
         loop = self._agents.loop
         self._cancel_judgement()
-        # While there is no tunnel, the pods are not to blame.
+        # While the relay cannot be used, the pods are not to blame.
         pods = running(self.status) if self._relay_trouble is None else 0
         self._verdict = self._reachability.judge(pods, now := loop.now())
         if self._verdict is not Reachability.OPEN and self._on_unreached is not None:

@@ -1,8 +1,8 @@
-"""Tunnel from this program to the relay of its FiberPool.
+"""Client of the relay of a FiberPool.
 
-``fiber._transport.relay`` says what a relay is for.  The tunnel finds the relay's pod, opens a
+``fiber._transport.relay`` says what a relay is for.  The client finds the relay's pod, opens a
 port-forward to it through the API server, and gives the connection of each agent to the pool's
-listener, through a socket pair.  When the port-forward breaks, the tunnel makes another one.  Then
+listener, through a socket pair.  When the port-forward breaks, the client makes another one.  Then
 the agents connect anew, and their links go on.
 """
 
@@ -43,12 +43,12 @@ class NoRelay(Exception):
     """Error: the relay has no pod yet that accepts connections.  Its text says why."""
 
 
-class RelayTunnel:
-    """Tunnel to the relay of one pool, on the thread ``fiber-relay``.
+class RelayClient:
+    """Client of the relay of one pool, on the thread ``fiber-relay``.
 
     The functions are called on that thread.  ``take`` gets a connection to an agent, and the
-    agent's address.  ``on_trouble`` gets the reason why there is no tunnel now, and "" once there
-    is one.  ``on_refused`` gets the error if this program may not open port-forwards.
+    agent's address.  ``on_trouble`` gets the reason why the relay cannot be used now, and "" once
+    it can.  ``on_refused`` gets the error if this program may not open port-forwards.
     """
 
     def __init__(
@@ -68,6 +68,9 @@ class RelayTunnel:
         self._loop = Loop()
         self._closing = threading.Event()
         self._dialer: threading.Thread | None = None
+        self._lock = threading.Lock()
+        self._opened: PortForward | None = None
+        """Connection on its way from the thread that dials; under the lock."""
         self._end: Multiplexer | None = None
         self._pause = _PAUSE_MIN
 
@@ -77,16 +80,25 @@ class RelayTunnel:
         self._loop.call_soon(self._dial, 0.0)
 
     def begin_close(self) -> None:
-        """Close all connections through the tunnel; return at once.  Any thread."""
-        self._closing.set()
+        """Close all connections through the relay; return at once.  Any thread."""
+        with self._lock:
+            self._closing.set()
+        if (carrier := self._collect()) is not None:
+            carrier.close()
         self._loop.call_soon(self._disconnect)
 
     def close(self) -> None:
-        """Close the tunnel, and wait for its end.  Do not call it on its own thread."""
+        """Close the client, and wait for its end.  Do not call it on its own thread."""
         self.begin_close()
         self._loop.stop()
         if self._dialer is not None:
             self._dialer.join(_CLOSE_TIMEOUT)
+
+    def _collect(self) -> PortForward | None:
+        """Return the connection on its way; None if somebody else has it."""
+        with self._lock:
+            carrier, self._opened = self._opened, None
+        return carrier
 
     def _disconnect(self) -> None:
         if self._end is not None:
@@ -106,7 +118,8 @@ class RelayTunnel:
             self._dialer.start()
         except RuntimeError as error:  # the system has no thread left; try again later
             self._dialer = None
-            self._fail(str(error))
+            self._on_trouble(str(error))
+            self._loop.call_later(_PAUSE_MAX, self._dial, 0.0)
 
     def _fail(self, reason: str) -> None:
         if self._closing.is_set():
@@ -115,9 +128,9 @@ class RelayTunnel:
         self._pause = min(2 * self._pause, _PAUSE_MAX)
         self._dial(self._pause)
 
-    def _connected(self, carrier: PortForward) -> None:
-        if self._closing.is_set():
-            carrier.close()
+    def _connected(self) -> None:
+        carrier = self._collect()
+        if carrier is None:
             return
         self._end = Multiplexer(
             self._loop, carrier, on_open=self._open, on_hello=self._greeted, on_end=self._broken
@@ -161,7 +174,15 @@ class RelayTunnel:
         except Exception as error:  # a bug must not end the attempts
             self._loop.call_soon(self._fail, f"unexpected {error!r}")
         else:
-            self._loop.call_soon(self._connected, carrier)
+            self._hand_over(carrier)
+
+    def _hand_over(self, carrier: PortForward) -> None:
+        with self._lock:
+            if not self._closing.is_set():
+                self._opened = carrier
+                self._loop.call_soon(self._connected)
+                return
+        carrier.close()
 
     def _find_pod(self) -> str:
         """Return the name of the relay's pod."""
@@ -188,8 +209,8 @@ def state_of(pod: Mapping[str, Any]) -> str:
     for container in status.get("containerStatuses") or ():
         waiting = (container.get("state") or {}).get("waiting")
         if waiting and waiting.get("reason") != "ContainerCreating":
-            return f"waits: {waiting.get('reason')}: {waiting.get('message', '')}".rstrip(": ")
+            return f"waits: {waiting.get('reason')}: {waiting.get('message') or ''}".rstrip(": ")
     for condition in status.get("conditions") or ():
         if condition.get("type") == "PodScheduled" and condition.get("status") == "False":
-            return f"has no node: {condition.get('message', '')}".rstrip(": ")
+            return f"has no node: {condition.get('message') or ''}".rstrip(": ")
     return "starts"

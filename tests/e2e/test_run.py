@@ -1,0 +1,178 @@
+"""``fiber run`` as a person uses it: output, exit status, Ctrl-C, a killed terminal, lost pods."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from e2e.accounts import ACCOUNT, may_run_programs
+from e2e.clusters import Cluster
+from e2e.program import Programs
+from e2e.scene import Scene
+from fiber_api import names
+from patience import PATIENCE
+
+pytestmark = pytest.mark.timeout(300, func_only=True)
+
+FIBER = Path(sys.executable).with_name("fiber")
+COUNT = """
+import sys, time
+import fiber as mp
+import helper
+
+if __name__ == "__main__":
+    print("to stdout", *sys.argv[1:], flush=True)
+    print("to stderr", file=sys.stderr, flush=True)
+    with mp.Pool(2) as pool:
+        print(pool.map(helper.square, range(5)), flush=True)
+    sys.exit(7)
+"""
+HELPER = "def square(number):\n    return number * number\n"
+WAIT = """
+import signal, sys, time
+
+def interrupted(*_):
+    print("interrupted", flush=True)
+    sys.exit(9)
+
+signal.signal(signal.SIGINT, interrupted)
+for number in range(10_000):
+    print(number, flush=True)
+    time.sleep(0.01)
+"""
+
+
+class Person:
+    """A person with a kubeconfig, who may run programs in one namespace."""
+
+    def __init__(self, scene: Scene, programs: Programs, folder: Path, image: str) -> None:
+        self.scene = scene
+        self.folder = folder
+        self._environment = {
+            **{key: value for key, value in os.environ.items() if not key.startswith("FIBER_")},
+            "KUBECONFIG": str(programs.kubeconfig),
+            "FIBER_NAMESPACE": scene.namespace,
+            "FIBER_IMAGE": image,
+        }
+        (folder / "count.py").write_text(COUNT, encoding="utf-8")
+        (folder / "helper.py").write_text(HELPER, encoding="utf-8")
+        (folder / "wait.py").write_text(WAIT, encoding="utf-8")
+
+    def start(self, *words: str) -> subprocess.Popen[str]:
+        return subprocess.Popen(
+            [FIBER, *words],
+            cwd=self.folder,
+            env=self._environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    def runs(self, *words: str) -> subprocess.CompletedProcess[str]:
+        with self.start(*words) as process:
+            output, errors = process.communicate(timeout=PATIENCE)
+        return subprocess.CompletedProcess(words, process.returncode, output, errors)
+
+    def pod(self, name: str) -> str:
+        """Return the name of a program's pod once it is there."""
+
+        def found() -> str | None:
+            for pod in self.scene.now["pods"].values():
+                if pod["metadata"]["labels"].get(names.LABEL_PROGRAM) == name:
+                    return str(pod["metadata"]["name"])
+            return None
+
+        return self.scene.wait(f"{name} has a pod", found) or ""
+
+
+@pytest.fixture
+def person(scene: Scene, programs: Programs, cluster: Cluster, tmp_path: Path) -> Person:
+    may_run_programs(scene)
+    return Person(scene, programs, tmp_path, cluster.images["fiber-worker"])
+
+
+def test_a_program_in_a_pod_has_the_output_and_status_that_it_has_here(person: Person) -> None:
+    done = person.runs("run", "--service-account", ACCOUNT, "count.py", "--steps", "3")
+    assert done.returncode == 7, done.stderr
+    assert done.stdout == "to stdout --steps 3\n[0, 1, 4, 9, 16]\n"
+    assert "to stderr\n" in done.stderr
+    assert "Traceback" not in done.stderr
+    listed = json.loads(person.runs("ps", "--output", "json").stdout)
+    assert [row["state"] for row in listed] == ["failed"]
+    shown = person.runs("logs", listed[0]["name"])
+    assert "to stdout --steps 3" in shown.stdout
+    assert person.runs("stop", listed[0]["name"]).returncode == 0
+    assert json.loads(person.runs("ps", "--output", "json").stdout) == []
+
+
+def test_ctrl_c_interrupts_the_program(person: Person) -> None:
+    with person.start("run", "--service-account", ACCOUNT, "--name", "waits", "wait.py") as run:
+        assert run.stdout is not None
+        assert run.stdout.readline() == "0\n"
+        run.send_signal(signal.SIGINT)
+        output, errors = run.communicate(timeout=PATIENCE)
+    assert run.returncode == 9, errors
+    assert output.endswith("interrupted\n")
+
+
+def test_a_killed_command_leaves_the_program_running(person: Person) -> None:
+    with person.start("run", "--service-account", ACCOUNT, "--name", "waits", "wait.py") as run:
+        assert run.stdout is not None
+        assert run.stdout.readline() == "0\n"
+        run.kill()
+        run.communicate()
+    (row,) = json.loads(person.runs("ps", "--output", "json").stdout)
+    assert (row["name"], row["state"]) == ("waits", "running")
+    with person.start("run", "--attach", "waits") as again:
+        assert again.stdout is not None
+        assert again.stdout.readline() == "0\n"
+        person.runs("stop", "waits", "--now")
+        again.communicate(timeout=PATIENCE)
+    assert again.returncode != 0
+
+
+def test_output_goes_on_where_it_was_after_the_api_server_was_away(
+    person: Person, cluster: Cluster
+) -> None:
+    with person.start("run", "--service-account", ACCOUNT, "--name", "waits", "wait.py") as run:
+        assert run.stdout is not None
+        lines = [run.stdout.readline() for _ in range(10)]
+        with cluster.without_apiserver():
+            pass
+        lines += [run.stdout.readline() for _ in range(1500)]
+        assert lines == [f"{number}\n" for number in range(1510)]
+        run.send_signal(signal.SIGINT)
+        run.communicate(timeout=PATIENCE)
+    assert run.returncode == 9
+
+
+def test_a_program_whose_pod_is_deleted_is_lost(person: Person) -> None:
+    with person.start("run", "--service-account", ACCOUNT, "--name", "waits", "wait.py") as run:
+        assert run.stdout is not None
+        assert run.stdout.readline() == "0\n"
+        path = person.scene.path("pods", person.pod("waits"))
+        person.scene.kube.delete(path, {"gracePeriodSeconds": 0})
+        _, errors = run.communicate(timeout=PATIENCE)
+    assert run.returncode == 125, errors
+    assert "fiber: the program 'waits'" in errors
+    assert "Traceback" not in errors
+
+
+def test_a_program_that_needs_too_much_memory_is_told_so(person: Person) -> None:
+    (person.folder / "swell.py").write_text("b'1' * (1 << 30)\n", encoding="utf-8")
+    done = person.runs("run", "--service-account", ACCOUNT, "--memory", "160Mi", "swell.py")
+    assert done.returncode != 0
+    assert "OOMKilled" in done.stderr, done.stderr
+
+
+def test_an_account_without_rights_is_told_which(person: Person) -> None:
+    done = person.runs("run", "count.py")
+    assert done.returncode == 125, done.stderr
+    assert "serviceaccounts" in done.stderr
+    assert "--service-account" in done.stderr
