@@ -14,8 +14,11 @@ import pytest
 import fiber
 from fakes.cluster import FakeCluster, fake_cluster
 from fakes.doctor_cluster import schema
+from fiber._cli import doctor, doctor_attempt
 from fiber._cli.doctor_rights import SCHEMA
+from fiber._cli.failures import INTERRUPTED
 from fiber_api import names
+from patience import PATIENCE
 from unit.kubernetes_rig import kubeconfig
 from unit.pool_command_rig import run
 
@@ -70,3 +73,16 @@ def test_a_container_that_ends_is_not_waited_for(cluster: FakeCluster) -> None:
     cluster.nodes.fails_with = ("RunContainerError", 'exec: "python": executable file not found')
     (found,) = trial()
     assert "lacks Fiber, or Python" in found["what"]
+
+
+@pytest.mark.parametrize("patience", [PATIENCE, 0.0], ids=["ends by itself", "is killed"])
+def test_ctrl_c_leaves_nothing(
+    cluster: FakeCluster, monkeypatch: pytest.MonkeyPatch, patience: float
+) -> None:
+    def interrupt(line: str) -> None:
+        raise KeyboardInterrupt
+
+    cluster.nodes.fails_with = ("ImagePullBackOff", "registry.example: no such host")
+    monkeypatch.setattr(doctor, "_tell", interrupt)
+    monkeypatch.setattr(doctor_attempt, "_TO_END", patience)
+    assert run("doctor").status == INTERRUPTED

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,7 @@ from fakes.served import served
 from fiber import config
 from fiber._backends.kubernetes.template import fiber_pool_body
 from fiber._cli import doctor
+from fiber._cli.doctor_attempt import LONGEST_START, settings_of
 from fiber._cli.doctor_rights import (
     PROGRAM_RIGHTS,
     RUN_RIGHTS,
@@ -251,3 +253,18 @@ def test_warm_pools_and_their_programs_are_listed(rig: DoctorRig) -> None:
     outcome: Outcome = run("doctor", "--no-trial")
     assert f"used (0 workers ready, used by {OTHER.identity}" in outcome.out
     assert "warm (0 workers ready, free)" in outcome.out
+
+
+def test_the_trial_has_the_configuration_of_this_machine() -> None:
+    environ = {
+        "FIBER_NAMESPACE": "lab",
+        "FIBER_NODE_SELECTOR": "disk=ssd",
+        "FIBER_TOLERATIONS": "spot,team=a:NoSchedule",
+        "FIBER_SHM": "2Gi",
+        "FIBER_LISTEN_PORT": "9000-9009",
+        "FIBER_POD_TIMEOUT": "60",
+    }
+    here = config.load(environ=environ)
+    sent = json.loads(json.dumps(settings_of(here)))
+    assert config.load(sent, environ={}) == replace(here, backend="kubernetes")
+    assert settings_of(config.load(environ={}))["pod_timeout"] == LONGEST_START
