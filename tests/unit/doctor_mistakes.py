@@ -14,15 +14,16 @@ import pytest
 from fakes.doctor_cluster import RESOURCES, DoctorCluster
 from fakes.kubernetes_api import Fault
 from fiber._backends.kubernetes.problems import AgentRoute, PoolName, failure, unreachable
-from fiber._cli.doctor_attempt import TrialCourse
+from fiber._cli.doctor_attempt import TrialCourse, mismatch_in
 from fiber._cli.doctor_trial_verdicts import Program
 from fiber._transport.authentication import Identity, version_mismatch
-from fiber.errors import FiberPoolError
+from fiber.errors import FiberPoolError, VersionMismatch
 from fiber_api import names
 from fiber_api.names import Reason
 from unit.kubernetes_rig import NAMESPACE, OTHER, pool_body
 
 ANSWER = {"python": "3.11.2", "fiber": Program("", "").fiber, "packages": 7}
+SIDES = {"ours": "3.99.1", "theirs": "3.11.7", "peer": "laptop-7"}
 POOL = PoolName("doctor-trial-1", NAMESPACE)
 
 
@@ -135,16 +136,12 @@ def _taint(rig: DoctorRig) -> None:
     rig.cluster.set_node(spec={"taints": [{"key": "team", "value": "a", "effect": "NoSchedule"}]})
 
 
-def _other_python(rig: DoctorRig) -> None:
+def _refused(**theirs: Any) -> Callable[[DoctorRig], None]:
+    """Let the program refuse an agent with another version."""
     here = Identity.of_this_process("")
-    error = version_mismatch(here, replace(here, python="3.99.1", name="doctor-trial-1-a"))
-    rig.course = TrialCourse(refusal=str(error))
-
-
-def _other_protocol(rig: DoctorRig) -> None:
-    here = Identity.of_this_process("")
-    error = version_mismatch(here, replace(here, protocol=0, name="doctor-trial-1-a"))
-    rig.course = TrialCourse(refusal=str(error))
+    error = version_mismatch(here, replace(here, name="doctor-trial-1-a", **theirs))
+    line = f"[fiber] an agent was refused: 10.0.0.7: {error}"
+    return lambda rig: setattr(rig, "course", TrialCourse(refusal=mismatch_in(line)))
 
 
 def _cut_off(relay: str) -> Callable[[DoctorRig], None]:
@@ -340,8 +337,15 @@ MISTAKES = [
         "runs as root",
         "USER",
     ),
-    Mistake("other Python", _other_python, "trial", "another Python", "fiber image"),
-    Mistake("other Fiber", _other_protocol, "trial", "another Fiber", "fiber image"),
+    Mistake("other Python", _refused(python="3.99.1"), "trial", "another Python", "fiber image"),
+    Mistake("other Fiber", _refused(protocol=0), "trial", "another Fiber", "fiber image"),
+    Mistake(
+        "agent that ends because of another Python",
+        _ends(Reason.CONTAINER_FAILED, f"Its last lines:\n{VersionMismatch('Python', **SIDES)}"),
+        "trial",
+        "another Python",
+        "fiber image",
+    ),
     Mistake("NetworkPolicy", _cut_off("a-relay"), "trial", "nor its relay", "NetworkPolicy"),
     Mistake("no relay wanted", _cut_off(""), "trial", "do not reach this program", "FIBER_RELAY"),
     Mistake(

@@ -11,6 +11,7 @@ import contextlib
 import dataclasses
 import json
 import queue
+import re
 import signal
 import socket
 import subprocess
@@ -53,8 +54,13 @@ _HOPELESS = frozenset(
 """Reasons of problems that end the trial at once.  A program waits longer, since it may have other
 workers, and a person may mend the image meanwhile."""
 
-REFUSED = "an agent was refused: "
-_OTHER_VERSION = "version mismatch"
+_MISMATCH = re.compile(r"\b(Python|Fiber protocol) version mismatch: .*", re.DOTALL)
+
+
+def mismatch_in(text: str) -> str:
+    """Return the words of a ``VersionMismatch`` in a message; empty if there are none."""
+    found = _MISMATCH.search(text)
+    return "" if found is None else found[0]
 
 
 @dataclass
@@ -171,9 +177,7 @@ class _Attempt:
         if kind == "err":
             self._trial.said.append(line)
             self._tell(line)
-            _, refused, why = line.partition(REFUSED)
-            if refused and _OTHER_VERSION in why:
-                self._trial.refusal = why
+            self._trial.refusal = mismatch_in(line) or self._trial.refusal
             return
         with contextlib.suppress(ValueError):
             said = json.loads(line)

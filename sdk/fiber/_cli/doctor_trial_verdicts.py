@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import fiber
 from fiber._backends.kubernetes.template import WORKER_IMAGE
-from fiber._cli.doctor_attempt import TrialCourse
+from fiber._cli.doctor_attempt import TrialCourse, mismatch_in
 from fiber._cli.doctor_verdicts import Verdict, fault, ok
 from fiber_api.names import LABEL_RELAY, MASTER_PORT, Reason
 
@@ -85,10 +85,10 @@ def _times(steps: Mapping[str, float]) -> str:
 
 
 def _failure(trial: TrialCourse, program: Program) -> Iterator[Verdict]:
-    if trial.refusal:
-        yield _other_version(trial.refusal, program)
-        return
     reason, message = _cause(trial)
+    if mismatch := trial.refusal or mismatch_in(message):
+        yield _other_version(mismatch, program)
+        return
     for known in (_of_image, _of_refusal, _of_place, _of_way):
         if (verdict := known(reason, message, program)) is not None:
             yield verdict
