@@ -62,7 +62,11 @@ def test_a_person_who_runs_programs_gets_jobs_and_logs_beside_them(roles: list[M
     rights: dict[str, set[str]] = {}
     for _, resource, verb in allowed(named(roles, "ClusterRole", "fiber-runner")):
         rights.setdefault(resource, set()).add(verb)
-    assert rights == {"jobs": {"create", "delete", "get", "list"}, "pods/log": {"get"}}
+    assert rights == {
+        "jobs": {"create", "delete", "get", "list"},
+        "pods/log": {"get"},
+        "serviceaccounts": {"get"},
+    }
 
 
 def test_the_test_touches_its_own_pool_alone(roles: list[Manifest]) -> None:

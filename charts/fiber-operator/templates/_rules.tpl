@@ -99,6 +99,10 @@ user:
     resources: [persistentvolumeclaims]
     verbs: [get]
 runner:
+  # Whether the account of programs exists.
+  - apiGroups: [""]
+    resources: [serviceaccounts]
+    verbs: [get]
   # Not for programs: who may make Jobs runs pods as any account of the namespace.
   - apiGroups: [batch]
     resources: [jobs]
