@@ -73,6 +73,7 @@ PROGRAM_RIGHTS = (
 """Rights of the chart's role fiber-user."""
 
 RUNNER_RIGHTS = (
+    *_all("get", ACCOUNTS),
     *_all("create delete get list", JOBS),
     *_all("get", PODS, "log"),
 )
