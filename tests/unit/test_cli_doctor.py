@@ -35,6 +35,7 @@ from unit.pool_command_rig import Outcome, examples_of, run
 def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[DoctorRig]:
     with served() as server:
         monkeypatch.setenv("KUBECONFIG", str(kubeconfig(tmp_path, server.api.url)))
+        monkeypatch.delenv("FIBER_IMAGE", raising=False)  # that of `make cluster`
         monkeypatch.chdir(tmp_path)
         made = DoctorRig(DoctorCluster(server, NAMESPACE), tmp_path, monkeypatch, server.api.url)
         monkeypatch.setattr(doctor, "attempt", made.attempt)

@@ -325,10 +325,10 @@ def _rights(facts: Facts, wanted: Sequence[Right], who: str) -> Iterator[Verdict
 
 
 def _remedy(namespace: str, wanted: Sequence[Right]) -> str:
-    roles = f"{ROLE} and {RUNNER_ROLE}" if wanted is RUN_RIGHTS else ROLE
+    roles = f"roles {ROLE} and {RUNNER_ROLE}" if wanted is RUN_RIGHTS else f"role {ROLE}"
     role = RUNNER_ROLE if wanted is RUN_RIGHTS else ROLE
     return (
-        f"ask an administrator for the role {roles}: `kubectl create rolebinding NAME "
+        f"ask an administrator for the {roles}: `kubectl create rolebinding NAME "
         f"--namespace {namespace} --clusterrole {role} --user YOU`"
     )
 
