@@ -13,7 +13,8 @@ status meaning
 ====== ======================================================================
 
 ``fiber run`` ends with the status of the program.  Its own errors have the status 125, as those of
-``docker run`` have.
+``docker run`` have, except mistakes of the command line.  A program that cannot be started has 126
+or 127, as in a shell, and one whose output nobody reads any longer has 141.
 """
 
 from __future__ import annotations
@@ -50,6 +51,10 @@ class CommandError(Exception):
         if self.remedy:
             lines.append(f"  do:   {self.remedy}")
         return "\n".join(lines)
+
+
+class ProgramEnded(CommandError):
+    """End of a program that ``fiber run`` follows.  Its status is the program's."""
 
 
 def not_found(kind: str, name: str, existing: Iterable[str], where: str) -> CommandError:
