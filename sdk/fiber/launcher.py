@@ -103,6 +103,12 @@ class Output:
         with self._changed:
             self._expected_until = time.monotonic() + self._linger
 
+    def expect_nobody(self) -> None:
+        """Note that no reader is going to come."""
+        with self._changed:
+            self._expected_until = 0.0
+            self._changed.notify_all()
+
     def add(self, kind: int, data: bytes) -> None:
         """Add output.  Waits for readers that would lose output, while they take some."""
         with self._changed:
@@ -414,13 +420,15 @@ class _Handler(BaseHTTPRequestHandler):
         except (TypeError, ValueError):
             self.send_error(400)
             return
-        if self.headers.get(FOLLOWS):
-            self._launcher.output.expect_reader()
+        self._launcher.output.expect_reader()  # the pod must not end before the answer
         with tempfile.TemporaryFile() as archive:
             self._receive(archive, size)
             self._launcher.start(archive, layout)
         failure = self._launcher.failure
         self._answer(**({FAILURE: failure.encode("ascii", "replace").decode()} if failure else {}))
+        self._wait_for_close()
+        if not failure and not self.headers.get(FOLLOWS):
+            self._launcher.output.expect_nobody()
 
     def do_POST(self) -> None:
         number = self._number()
@@ -438,8 +446,12 @@ class _Handler(BaseHTTPRequestHandler):
             self._answer()
             for record in records:
                 self.wfile.write(record)
-            self.connection.settimeout(_LINGER)
-            self.rfile.read(1)  # the reader closes the connection
+            self._wait_for_close()
+
+    def _wait_for_close(self) -> None:
+        """Wait until the client closes the connection: it has got the answer."""
+        self.connection.settimeout(_LINGER)
+        self.rfile.read(1)
 
     @property
     def _launcher(self) -> ProgramLauncher:

@@ -17,7 +17,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 from aiohttp import WSMsgType, web
 
@@ -77,6 +76,10 @@ class ProgramNodes:
         """Setting: each pod runs at once."""
         self.cuts: list[int] = []
         """Bytes from a pod after which each of the next port-forwards breaks."""
+        self.at_forward: Callable[[], object] = lambda: None
+        """Called before a port-forward is answered."""
+        self.also_after: Callable[[Call], object] = lambda call: None
+        """Told of each call, as ``KubernetesApi.after`` is."""
         self.forwards = 0
         """Port-forwards that were opened."""
         self.launched: dict[str, Launched] = {}
@@ -96,13 +99,10 @@ class ProgramNodes:
         """Run a pod."""
         self._server.do(self._start, name)
 
-    def kill(
-        self, pod: str, *, reason: str = "Error", phase: str = "Failed", **status: Any
-    ) -> None:
-        """Kill the launcher and its program without a word."""
-        launched = self.launched[pod]
-        self._server.do(self._set_end, pod, 137, reason, phase, status)
-        kill(launched)
+    def kill(self, pod: str, container_reason: str = "Error", **status: str) -> None:
+        """Kill the launcher and its program without a word; ``status`` is the pod's, too."""
+        self._server.do(self._set_end, pod, 137, container_reason, "Failed", status)
+        kill(self.launched[pod])
 
     def pods(self) -> list[str]:
         return [str(pod["metadata"]["name"]) for pod in self._server.objects("pods")]
@@ -183,6 +183,7 @@ class ProgramNodes:
             self._store.set_status("jobs", namespace, job, status)
 
     def _after(self, call: Call) -> None:
+        self.also_after(call)
         if call.verb != "delete" or call.plural != "jobs":
             return
         present = {pod["metadata"]["name"] for pod in self._store.list("pods")}
@@ -210,6 +211,7 @@ class ProgramNodes:
 
     async def _forward(self, request: web.Request, call: Call) -> web.StreamResponse:
         self.forwards += 1
+        self.at_forward()
         response = web.WebSocketResponse(protocols=("v4.channel.k8s.io",), max_msg_size=0)
         await response.prepare(request)
         port = (names.LAUNCHER_PORT).to_bytes(2, "little")
@@ -273,11 +275,12 @@ def _free_port() -> int:
 
 def kill(launched: Launched) -> None:
     """Kill a launcher, if it runs, and its program."""
-    for child in _children(launched.process.pid):
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(child, signal.SIGKILL)
+    children = list(_children(launched.process.pid))
     if launched.process.poll() is None:
         launched.process.kill()
+    for child in children:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(child, signal.SIGKILL)
 
 
 def _children(pid: int) -> Iterator[int]:

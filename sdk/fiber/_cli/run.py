@@ -94,6 +94,10 @@ def command(namespace: str | None, context: str | None, **options: Any) -> int:
         if error.status != USAGE:
             error.status = FAILED
         raise
+    except OSError as error:  # for example, the working directory is gone
+        raise CommandError(
+            "cannot run the program", str(error), "mend that and try again", FAILED
+        ) from error
 
 
 def _check(options: dict[str, Any]) -> None:

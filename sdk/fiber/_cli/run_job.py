@@ -102,7 +102,12 @@ def _worker_template(options: dict[str, Any], settings: config.Config) -> Body:
             shape = dataclasses.replace(shape, image=options["image"])
         return pod_template(shape, None, "", sys.executable)
     except (ConfigError, TypeError, ValueError) as error:
-        raise CommandError("the program's pod cannot be made", str(error), status=USAGE) from error
+        raise CommandError(
+            "the program's pod cannot be made",
+            str(error),
+            "correct the option, or the configuration that the message names",
+            USAGE,
+        ) from error
 
 
 def _make_launcher(container: Body, source: Source, options: dict[str, Any]) -> None:
