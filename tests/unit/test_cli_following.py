@@ -1,4 +1,4 @@
-"""What ``fiber run`` shows of a program, and how each of the two ends."""
+"""Output of a program that ``fiber run`` follows, and the ends of both."""
 
 from __future__ import annotations
 

@@ -399,6 +399,12 @@ def test_a_pod_without_a_program_ends_at_once(site: Site) -> None:
     assert pod.end() == 143
 
 
+def test_a_program_may_be_ended_before_its_files_are_there(site: Site) -> None:
+    pod = site.pod("true")
+    assert pod.signal(signal.SIGTERM) == 200
+    assert pod.end() == 143
+
+
 def test_orphans_are_reaped(site: Site) -> None:
     pod = site.python(
         "import os, time\n"
