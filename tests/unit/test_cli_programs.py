@@ -121,7 +121,7 @@ HEAD = b"HTTP/1.0 200 OK\r\n\r\n"
 def test_a_connection_that_is_silent_for_long_is_broken(
     site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nothing says that a node is gone."""
+    """Read from a node that is gone, which nothing says."""
     monkeypatch.setattr(programs, "_SILENCE", 0.1)
     data = RECORD.pack(STDOUT, 3) + b"abc"
     with site.answering(HEAD + data):
