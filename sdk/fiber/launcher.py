@@ -97,17 +97,25 @@ class Output:
         self._positions: dict[object, int] = {}
         """Positions of the readers that take what they are given."""
         self._expected_until = 0.0
+        self._answering = 0
+        """Requests that are being answered."""
 
     def expect_reader(self) -> None:
         """Note that a reader is going to come."""
         with self._changed:
             self._expected_until = time.monotonic() + self._linger
 
-    def expect_nobody(self) -> None:
-        """Note that no reader is going to come."""
+    @contextlib.contextmanager
+    def answering(self) -> Iterator[None]:
+        """Keep the pod until a request is answered, which may be what ends it."""
         with self._changed:
-            self._expected_until = 0.0
-            self._changed.notify_all()
+            self._answering += 1
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._answering -= 1
+                self._changed.notify_all()
 
     def add(self, kind: int, data: bytes) -> None:
         """Add output.  Waits for readers that would lose output, while they take some."""
@@ -226,6 +234,8 @@ class Output:
             while True:
                 if self._positions:
                     self._wait_for_progress()
+                elif self._answering:
+                    self._changed.wait_for(lambda: not self._answering)
                 elif (left := self._expected_until - time.monotonic()) > 0:
                     self._changed.wait(left)
                 else:
@@ -420,23 +430,21 @@ class _Handler(BaseHTTPRequestHandler):
         except (TypeError, ValueError):
             self.send_error(400)
             return
-        self._launcher.output.expect_reader()  # the pod must not end before the answer
         with tempfile.TemporaryFile() as archive:
             self._receive(archive, size)
-            self._launcher.start(archive, layout)
-        failure = self._launcher.failure
-        self._answer(**({FAILURE: failure.encode("ascii", "replace").decode()} if failure else {}))
-        self._wait_for_close()
-        if not failure and not self.headers.get(FOLLOWS):
-            self._launcher.output.expect_nobody()
+            with self._launcher.output.answering():
+                self._launcher.start(archive, layout)
+                self._answer_start(self._launcher.failure)
 
     def do_POST(self) -> None:
         number = self._number()
         if number not in signal.valid_signals():
             self.send_error(400)
             return
-        self._launcher.end_by(number)
-        self._answer()
+        with self._launcher.output.answering():
+            self._launcher.end_by(number)
+            self._answer()
+            self._wait_for_close()
 
     def do_GET(self) -> None:
         if (position := self._number()) < 0:
@@ -447,6 +455,12 @@ class _Handler(BaseHTTPRequestHandler):
             for record in records:
                 self.wfile.write(record)
             self._wait_for_close()
+
+    def _answer_start(self, failure: str) -> None:
+        if failure or self.headers.get(FOLLOWS):
+            self._launcher.output.expect_reader()
+        self._answer(**({FAILURE: failure.encode("ascii", "replace").decode()} if failure else {}))
+        self._wait_for_close()
 
     def _wait_for_close(self) -> None:
         """Wait until the client closes the connection: it has got the answer."""

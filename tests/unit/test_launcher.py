@@ -510,6 +510,22 @@ def test_the_end_waits_only_for_readers_that_there_are() -> None:
     output.wait_for_readers()  # everybody has everything
 
 
+def test_the_end_waits_for_an_answer() -> None:
+    output = Output()
+    output.end(0)
+    ended = threading.Event()
+
+    def wait() -> None:
+        output.wait_for_readers()
+        ended.set()
+
+    waiter = threading.Thread(target=wait)
+    with output.answering():
+        waiter.start()
+        assert not ended.is_set()
+    waiter.join()
+
+
 def test_the_end_waits_for_a_reader_that_broke_off_to_come_again() -> None:
     output = Output(linger=3600)
     output.add(STDOUT, b"out")
