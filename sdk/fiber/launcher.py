@@ -13,69 +13,146 @@ It is configured by its environment:
 
 ``fiber run`` speaks HTTP with it:
 
-``PUT /program``            start the program; the body is an archive of its files (tar and gzip),
-                            and the header ``Fiber-Layout`` has JSON: the working directory and the
-                            entries of ``PYTHONPATH``, relative to the folder
+``PUT /program``            start the program; the body is an archive of its files (tar and gzip).
+                            The header ``Fiber-Layout`` has JSON: the working directory and the
+                            entries of ``PYTHONPATH``, relative to the folder.  With the header
+                            ``Fiber-Follows`` a reader of the output is going to come.  The answer
+                            has the header ``Fiber-Failure`` if the program could not be started
 ``GET /output/POSITION``    the records of the output from that position on, until the end
-``POST /signal/NUMBER``     send a signal to the program
+``POST /signal/NUMBER``     send a signal to the program, or end if it does not run yet
 
-A record of the output has a head of a byte and four bytes: what it is, and its length.  1 is
-standard output, 2 is standard error, 3 says how many bytes were dropped before, and 4 is the
-program's exit status.  A position counts the bytes of output.
+A record of the output has a head of a byte and four bytes: what it is, and its length.  0 says that
+the launcher is alive, 1 is standard output, 2 is standard error, 3 says how many bytes were dropped
+before, and 4 is the program's exit status.  A position counts the bytes of output.  A reader closes
+its connection once it has the exit status; the pod may end only then.
 
-Exit status: that of the program, 128 and the number of the signal that ended it, or 125 if the
-program could not be started.
+Exit status: that of the program, 128 and the number of the signal that ended it, 127 if there is no
+such command, 126 if it cannot be executed, or 125 if its files did not arrive or were refused.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
+import fcntl
+import itertools
 import json
 import os
+import select
 import signal
+import socketserver
 import struct
 import subprocess
 import sys
 import tempfile
+import termios
 import threading
+import time
 from collections import deque
 from collections.abc import Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from typing import IO, Any
 
 from fiber._agent.zygote import unpack
 
-FAILED = 125
-STDOUT, STDERR, DROPPED, EXIT = 1, 2, 3, 4
+FAILED, NOT_EXECUTABLE, NO_COMMAND = 125, 126, 127
+ALIVE, STDOUT, STDERR, DROPPED, EXIT = range(5)
 RECORD = struct.Struct(">BI")
+NUMBER = struct.Struct(">Q")
+"""Content of a record DROPPED."""
+STATUS = struct.Struct(">i")
+"""Content of a record EXIT."""
+
+FOLLOWS, FAILURE = "Fiber-Follows", "Fiber-Failure"
+LAYOUT = "Fiber-Layout"
+
+HEARTBEAT = 10.0
+"""Seconds of silence after which a reader is told that the launcher is alive."""
 
 _KEPT = 16 << 20
-"""Bytes of output that are kept for readers.  The pod's log has what is dropped."""
+"""Bytes of output that are kept for readers.  A program waits for a reader that is further behind,
+and the pod's log has what is dropped for the others."""
 
 _PIECE = 64 << 10
+_BATCH = 256 << 10
+"""Bytes after which records are sent."""
+
+_PIECE_COST = 256
+"""Bytes that a piece of output takes beside its contents, or a little more."""
+
 _LINGER = 10.0
-"""Seconds that the last output waits for a reader."""
+"""Seconds that a reader has to come, to come again, and to take a part of the output."""
 
 
 class Output:
     """Output of the program, for readers that come and go.  Any thread."""
 
-    def __init__(self) -> None:
+    def __init__(self, kept: int = _KEPT, linger: float = _LINGER) -> None:
+        self._kept, self._linger = kept, linger
         self._changed = threading.Condition()
-        self._pieces: deque[tuple[int, bytes]] = deque()
+        self._pieces: deque[tuple[int, bytearray]] = deque()
         self._begin = self._end = 0
         """Positions of the oldest byte that is kept, and after the newest."""
         self._status: int | None = None
-        self._was_read = False
+        self._positions: dict[object, int] = {}
+        """Positions of the readers that take what they are given."""
+        self._expected_until = 0.0
+        self._answering = 0
+        """Requests that are being answered."""
+
+    def expect_reader(self) -> None:
+        """Note that a reader is going to come."""
+        with self._changed:
+            self._expected_until = time.monotonic() + self._linger
+
+    @contextlib.contextmanager
+    def answering(self) -> Iterator[None]:
+        """Keep the pod until a request is answered, which may be what ends it."""
+        with self._changed:
+            self._answering += 1
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._answering -= 1
+                self._changed.notify_all()
 
     def add(self, kind: int, data: bytes) -> None:
-        """Add output."""
+        """Add output.  Waits for readers that would lose output, while they take some."""
         with self._changed:
-            self._pieces.append((kind, data))
-            self._end += len(data)
-            while self._end - self._begin > _KEPT:
-                self._begin += len(self._pieces.popleft()[1])
+            self._append(kind, data)
             self._changed.notify_all()
+            while self._is_full():
+                if self._is_awaited() and self._wait_for_progress():
+                    continue
+                self._begin += len(self._pieces.popleft()[1])
+
+    def _append(self, kind: int, data: bytes) -> None:
+        last = self._pieces[-1] if self._pieces else None
+        if last is not None and last[0] == kind and len(last[1]) + len(data) <= _PIECE:
+            last[1].extend(data)
+        else:
+            self._pieces.append((kind, bytearray(data)))
+        self._end += len(data)
+
+    def _is_full(self) -> bool:
+        size = self._end - self._begin + _PIECE_COST * len(self._pieces)
+        return size > self._kept and len(self._pieces) > 1
+
+    def _is_awaited(self) -> bool:
+        """Return whether a reader has not got the oldest piece."""
+        oldest = self._begin + len(self._pieces[0][1])
+        return any(position < oldest for position in self._positions.values())
+
+    def _wait_for_progress(self) -> bool:
+        """Wait until a reader gets on, and return whether one did; leave the slowest behind."""
+        before = dict(self._positions)
+        if self._changed.wait_for(lambda: self._positions != before, self._linger):
+            return True
+        slowest = min(before.values(), default=0)
+        for reader in [each for each, position in before.items() if position == slowest]:
+            del self._positions[reader]
+        return False
 
     def end(self, status: int) -> None:
         """Note that the program has ended, and that all its output was added."""
@@ -83,78 +160,157 @@ class Output:
             self._status = status
             self._changed.notify_all()
 
-    def read(self, position: int) -> Iterator[bytes]:
-        """Yield the records from ``position`` on, and wait for more until the program has ended."""
-        while True:
-            with self._changed:
-                while self._end <= position and self._status is None:
-                    self._changed.wait()
-                begin, pieces = self._begin, list(self._pieces)
-                status = self._status
-            if position < begin:
-                yield RECORD.pack(DROPPED, 4) + struct.pack(">I", begin - position)
-                position = begin
-            at = begin
-            for kind, data in pieces:
-                if at + len(data) > position:
-                    rest = data[max(position - at, 0) :]
-                    yield RECORD.pack(kind, len(rest)) + rest
-                    position = at + len(data)
-                at += len(data)
-            if status is not None:
-                yield RECORD.pack(EXIT, 4) + struct.pack(">i", status)
-                return
+    @contextlib.contextmanager
+    def reading(self, position: int, heartbeat: float = HEARTBEAT) -> Iterator[Iterator[bytes]]:
+        """Yield the records from ``position`` on, which wait for more until the program has ended.
 
-    def was_read(self) -> None:
-        """Note that a reader has got everything."""
+        To leave without an error means that the reader has everything.
+        """
+        reader = object()
         with self._changed:
-            self._was_read = True
+            self._positions[reader] = position
+        try:
+            yield self._records(reader, position, heartbeat)
+        except BaseException:
+            self._leave(reader, self._linger)
+            raise
+        self._leave(reader, 0.0)
+
+    def _leave(self, reader: object, linger: float) -> None:
+        with self._changed:
+            self._positions.pop(reader, None)
+            self._expected_until = time.monotonic() + linger
             self._changed.notify_all()
 
-    def wait_for_reader(self, seconds: float) -> None:
-        """Wait until a reader has got everything."""
+    def _records(self, reader: object, position: int, heartbeat: float) -> Iterator[bytes]:
+        while True:
+            with self._changed:
+                self._got(reader, position)
+                came = self._wait_for_news(position, heartbeat)
+                begin, status = self._begin, self._status
+                found, next_position = self._next(max(position, begin))
+            if not came:
+                yield RECORD.pack(ALIVE, 0)
+                continue
+            if position < begin:
+                yield RECORD.pack(DROPPED, NUMBER.size) + NUMBER.pack(begin - position)
+            if found:
+                yield found
+            elif status is not None:
+                yield RECORD.pack(EXIT, STATUS.size) + STATUS.pack(status)
+                return
+            position = next_position
+
+    def _wait_for_news(self, position: int, seconds: float) -> bool:
+        return self._changed.wait_for(
+            lambda: self._end > position or self._status is not None, seconds
+        )
+
+    def _got(self, reader: object, position: int) -> None:
+        if self._positions.get(reader) != position:
+            self._positions[reader] = position
+            self._changed.notify_all()
+
+    def _next(self, position: int) -> tuple[bytes, int]:
+        """Return some records from ``position`` on, and the position after them."""
+        at, first = self._end, len(self._pieces)
+        for _, data in reversed(self._pieces):  # a reader is near the end as a rule
+            if at <= position:
+                break
+            first -= 1
+            at -= len(data)
+        found = bytearray()
+        for kind, data in itertools.islice(self._pieces, first, None):
+            rest = data[position - at :]
+            found += RECORD.pack(kind, len(rest)) + rest
+            at = position = at + len(data)
+            if len(found) >= _BATCH:
+                break
+        return bytes(found), position
+
+    def wait_for_readers(self) -> None:
+        """Wait until the readers that are there, or are expected, have got everything."""
         with self._changed:
-            self._changed.wait_for(lambda: self._was_read, seconds)
+            while True:
+                if self._positions:
+                    self._wait_for_progress()
+                elif self._answering:
+                    self._changed.wait_for(lambda: not self._answering)
+                elif (left := self._expected_until - time.monotonic()) > 0:
+                    self._changed.wait(left)
+                else:
+                    return
 
 
-class Launcher:
+class ProgramLauncher:
     """Runner of one program."""
 
-    def __init__(self, command: list[str], folder: str) -> None:
-        self.output = Output()
+    def __init__(self, command: list[str], folder: str, output: Output) -> None:
+        self.output = output
+        self.started = threading.Event()
+        """Set once the program runs, or never will."""
+        self.failure = ""
+        """Reason why the program could not be started."""
+        self.received = 0
+        """Bytes of archives that have arrived."""
+        self._status: int | None = None
+        """Exit status, if the program was not started."""
         self._command = command
         self._folder = folder
-        self._lock = threading.Lock()
+        self._starting = threading.Lock()
+        self._lock = threading.RLock()  # the main thread's signal handlers take it, too
         self._process: subprocess.Popen[bytes] | None = None
         self._copies: list[threading.Thread] = []
-        self.started = threading.Event()
-        """Set once the program runs, or cannot be started."""
+        self._ended, self._ended_in = os.pipe2(os.O_CLOEXEC)
+        """Pipe whose end says that the program has ended."""
 
     def start(self, archive: IO[bytes], layout: dict[str, Any]) -> None:
         """Unpack the archive and start the program.
 
         A repeated call does nothing: the answer to the first may have been lost.
         """
-        with self._lock:
-            if self._process is not None:
+        with self._starting:
+            if self.started.is_set():
                 return
-            unpack(archive.fileno(), self._folder)
-            self._process = self._popen(layout)
-            for kind, pipe in ((STDOUT, self._process.stdout), (STDERR, self._process.stderr)):
-                copy = threading.Thread(target=self._copy, args=(kind, pipe), daemon=True)
-                copy.start()
-                self._copies.append(copy)
+            try:
+                unpack(archive.fileno(), self._folder)
+                self._begin(layout)
+            except Exception as error:  # `fiber run` and the log report it
+                self._fail(FAILED, f"the program's files cannot be unpacked: {_words(error)}")
             self.started.set()
 
-    def _popen(self, layout: dict[str, Any]) -> subprocess.Popen[bytes]:
+    def _begin(self, layout: dict[str, Any]) -> None:
+        directory = os.path.join(self._folder, layout.get("directory", ""))
+        os.makedirs(directory, exist_ok=True)
+        try:
+            process = self._popen(directory, self._environment(layout))
+        except OSError as error:
+            missing = error.errno in (errno.ENOENT, errno.ENOTDIR)
+            reason = "there is no such command in the image or the program's folder"
+            self._fail(
+                NO_COMMAND if missing else NOT_EXECUTABLE,
+                f"cannot run {self._command[0]!r}: {reason if missing else _words(error)}",
+            )
+            return
+        for kind, pipe in ((STDOUT, process.stdout), (STDERR, process.stderr)):
+            copy = threading.Thread(
+                target=self._copy, args=(kind, pipe), name="fiber-output-copy", daemon=True
+            )
+            copy.start()
+            self._copies.append(copy)
+        with self._lock:
+            self._process = process
+
+    def _environment(self, layout: dict[str, Any]) -> dict[str, str]:
         environment = {k: v for k, v in os.environ.items() if not k.startswith("FIBER_LAUNCHER_")}
         paths = [os.path.join(self._folder, path) for path in layout.get("path", [])]
         if before := environment.get("PYTHONPATH"):
             paths.append(before)
         if paths:
             environment["PYTHONPATH"] = os.pathsep.join(paths)
-        directory = os.path.join(self._folder, layout.get("directory", ""))
-        os.makedirs(directory, exist_ok=True)
+        return environment
+
+    def _popen(self, directory: str, environment: dict[str, str]) -> subprocess.Popen[bytes]:
         return subprocess.Popen(
             self._command,
             cwd=directory,
@@ -165,93 +321,219 @@ class Launcher:
             start_new_session=True,
         )
 
+    def _fail(self, status: int, reason: str) -> None:
+        self.failure = reason
+        self._status = status
+        line = f"fiber run: {reason}\n".encode()
+        self.output.add(STDERR, line)
+        _log(STDERR, line)
+
     def _copy(self, kind: int, pipe: IO[bytes]) -> None:
-        while data := os.read(pipe.fileno(), _PIECE):
+        """Copy output until its end or, if other processes hold the pipe, the program's end."""
+        poller = select.poll()
+        poller.register(pipe.fileno(), select.POLLIN)
+        poller.register(self._ended, select.POLLIN)
+        left = None
+        while left is None or left > 0:
+            ready = {descriptor for descriptor, _ in poller.poll()}
+            if left is None and self._ended in ready:
+                poller.unregister(self._ended)
+                left = _waiting_in(pipe)
+                continue
+            data = os.read(pipe.fileno(), _PIECE)
+            if not data:
+                return
+            left = None if left is None else left - len(data)
             self.output.add(kind, data)
-            with contextlib.suppress(OSError):  # the log of the pod
-                os.write(kind, data)
+            _log(kind, data)
 
     def signal(self, number: int) -> None:
         """Send a signal to the processes of the program, as a terminal does."""
-        if self._process is not None and self._process.poll() is None:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(self._process.pid, number)
+        with self._lock:
+            if self._process is not None and self._process.returncode is None:
+                with contextlib.suppress(ProcessLookupError):
+                    os.killpg(self._process.pid, number)
+
+    def end_by(self, number: int) -> None:
+        """Pass on a signal, or end if the program does not run yet."""
+        if not self.started.is_set():
+            self._status = 128 + number
+            self.started.set()
+        self.signal(number)
 
     def wait(self) -> int:
         """Return the program's exit status once it has ended and its output was added."""
-        assert self._process is not None
-        returned = self._process.wait()
-        for copy in self._copies:
-            copy.join(1.0)  # a process that the program left behind may hold the pipe
-        status = 128 - returned if returned < 0 else returned
+        status = self._status
+        if self._process is not None:
+            status = self._reap(self._process)
+            os.close(self._ended_in)
+            for copy in self._copies:
+                copy.join()
+        assert status is not None
         self.output.end(status)
         return status
 
+    def _reap(self, process: subprocess.Popen[bytes]) -> int:
+        """Wait for the program and, as process 1 has to, for all orphans that end before."""
+        while True:
+            found = os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOWAIT)
+            assert found is not None
+            with self._lock:  # the number must not be another process's when it gets a signal
+                _, code = os.waitpid(found.si_pid, 0)
+                status = os.waitstatus_to_exitcode(code)
+                if found.si_pid == process.pid:
+                    process.returncode = status
+                    return 128 - status if status < 0 else status
 
-def _handler(launcher: Launcher) -> type[BaseHTTPRequestHandler]:
-    class Handler(BaseHTTPRequestHandler):
-        protocol_version = "HTTP/1.0"
 
-        def do_PUT(self) -> None:
-            layout = json.loads(self.headers.get("Fiber-Layout") or "{}")
-            try:
-                with tempfile.TemporaryFile() as archive:
-                    self._receive(archive)
-                    launcher.start(archive, layout)
-            except Exception as error:  # `fiber run` reports it
-                self.send_error(500, " ".join(str(error).split()) or type(error).__name__)
-            else:
-                self._answer()
+def _waiting_in(pipe: IO[bytes]) -> int:
+    """Return the number of bytes that can be read at once."""
+    return int.from_bytes(fcntl.ioctl(pipe.fileno(), termios.FIONREAD, bytes(4)), sys.byteorder)
 
-        def do_POST(self) -> None:
-            launcher.signal(int(self.path.rpartition("/")[2]))
+
+def _log(descriptor: int, data: bytes) -> None:
+    """Write to the log of the pod."""
+    with contextlib.suppress(OSError):
+        left = memoryview(data)
+        while left:
+            left = left[os.write(descriptor, left) :]
+
+
+def _words(error: BaseException) -> str:
+    """Return the error's message in one line."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+class _LauncherServer(socketserver.ThreadingTCPServer):
+    """Server of the launcher.  It looks up no name, as ``http.server`` would."""
+
+    daemon_threads = True
+    allow_reuse_address = True
+    block_on_close = False
+
+    def __init__(self, port: int, launcher: ProgramLauncher) -> None:
+        self.launcher = launcher
+        super().__init__(("127.0.0.1", port), _Handler)
+
+    def handle_error(self, request: object, client_address: object) -> None:
+        """Write nothing: readers break off, and the log is the program's."""
+
+
+class _Handler(BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.0"
+    server: _LauncherServer
+
+    def do_PUT(self) -> None:
+        try:
+            size = int(self.headers["Content-Length"])
+            layout = json.loads(self.headers.get(LAYOUT) or "{}")
+        except (TypeError, ValueError):
+            self.send_error(400)
+            return
+        with tempfile.TemporaryFile() as archive:
+            self._receive(archive, size)
+            with self._launcher.output.answering():
+                self._launcher.start(archive, layout)
+                self._answer_start(self._launcher.failure)
+
+    def do_POST(self) -> None:
+        number = self._number()
+        if number not in signal.valid_signals():
+            self.send_error(400)
+            return
+        with self._launcher.output.answering():
+            self._launcher.end_by(number)
             self._answer()
+            self._wait_for_close()
 
-        def do_GET(self) -> None:
+    def do_GET(self) -> None:
+        if (position := self._number()) < 0:
+            self.send_error(404)
+            return
+        with self._launcher.output.reading(position) as records:
             self._answer()
-            for record in launcher.output.read(int(self.path.rpartition("/")[2])):
+            for record in records:
                 self.wfile.write(record)
-            launcher.output.was_read()
+            self._wait_for_close()
 
-        def _receive(self, file: IO[bytes]) -> None:
-            left = int(self.headers["Content-Length"])
-            while left:
-                piece = self.rfile.read(min(left, _PIECE))
-                if not piece:
-                    raise ConnectionResetError("the connection broke")
-                file.write(piece)
-                left -= len(piece)
-            file.seek(0)
+    def _answer_start(self, failure: str) -> None:
+        if failure or self.headers.get(FOLLOWS):
+            self._launcher.output.expect_reader()
+        self._answer(**({FAILURE: failure.encode("ascii", "replace").decode()} if failure else {}))
+        self._wait_for_close()
 
-        def _answer(self) -> None:
-            self.send_response(200)
-            self.end_headers()
+    def _wait_for_close(self) -> None:
+        """Wait until the client closes the connection: it has got the answer."""
+        self.connection.settimeout(_LINGER)
+        self.rfile.read(1)
 
-        def log_message(self, *_: object) -> None:
-            """Write nothing: the log is the program's."""
+    @property
+    def _launcher(self) -> ProgramLauncher:
+        return self.server.launcher
 
-    return Handler
+    def _number(self) -> int:
+        last = self.path.rpartition("/")[2]
+        return int(last) if last.isascii() and last.isdigit() else -1
+
+    def _receive(self, file: IO[bytes], left: int) -> None:
+        while left > 0:
+            piece = self.rfile.read(min(left, _PIECE))
+            if not piece:
+                raise ConnectionResetError("the connection broke")
+            file.write(piece)
+            left -= len(piece)
+            self._launcher.received += len(piece)
+        file.flush()
+        file.seek(0)
+
+    def _answer(self, **headers: str) -> None:
+        self.send_response(200)
+        for name, value in headers.items():
+            self.send_header(name, value)
+        self.end_headers()
+
+    def log_message(self, *_: object) -> None:
+        """Write nothing: the log is the program's."""
+
+
+def _wait_for_files(launcher: ProgramLauncher, seconds: float) -> bool:
+    """Wait until the program was started; return False if nothing arrives for so long."""
+    received = 0
+    while not launcher.started.wait(seconds):
+        if received == launcher.received:
+            return False
+        received = launcher.received
+    return True
 
 
 def main() -> int:
     """Run the program; return the exit status."""
-    launcher = Launcher(
-        json.loads(os.environ["FIBER_LAUNCHER_COMMAND"]), os.environ["FIBER_LAUNCHER_FOLDER"]
-    )
-    server = ThreadingHTTPServer(
-        ("127.0.0.1", int(os.environ["FIBER_LAUNCHER_PORT"])), _handler(launcher)
-    )
-    server.daemon_threads = True
-    threading.Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        command = json.loads(os.environ["FIBER_LAUNCHER_COMMAND"])
+        folder = os.environ["FIBER_LAUNCHER_FOLDER"]
+        port = int(os.environ["FIBER_LAUNCHER_PORT"])
+        seconds = float(os.environ["FIBER_LAUNCHER_WAIT"])
+    except (KeyError, ValueError) as error:
+        print(f"fiber.launcher is for the pods of `fiber run`: {error}", file=sys.stderr)
+        return FAILED
+    launcher = ProgramLauncher(command, folder, Output())
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-        signal.signal(number, lambda received, _: launcher.signal(received))
-    if not launcher.started.wait(float(os.environ["FIBER_LAUNCHER_WAIT"])):
+        signal.signal(number, lambda received, _: launcher.end_by(received))
+    try:
+        server = _LauncherServer(port, launcher)
+    except OSError as error:
+        print(f"fiber run: cannot listen at port {port}: {_words(error)}", file=sys.stderr)
+        return FAILED
+    threading.Thread(target=server.serve_forever, name="fiber-serve", daemon=True).start()
+    if not _wait_for_files(launcher, seconds):
         print("fiber run: the program's files did not arrive in time", file=sys.stderr)
         return FAILED
     status = launcher.wait()
-    launcher.output.wait_for_reader(_LINGER)
+    launcher.output.wait_for_readers()
     return status
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    status = main()
+    sys.stderr.flush()
+    os._exit(status)  # a thread may be in the middle of a write

@@ -11,7 +11,7 @@ import asyncio
 import contextlib
 import json
 import ssl
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -73,6 +73,9 @@ class Fault:
         return True
 
 
+Subresource = Callable[[web.Request, Call], Awaitable[web.StreamResponse]]
+
+
 class KubernetesApi:
     """Serves ``store`` on a port of 127.0.0.1."""
 
@@ -102,6 +105,8 @@ class KubernetesApi:
         self.date: str | None = None
         """Header ``Date`` of these answers; None: the time of this machine."""
         self.forwards = PortForwards()
+        self.subresources: dict[str, Subresource] = {}
+        """Servers of GET calls about a part of an object, by the name of the part."""
         self.port = 0
         self.server: Callable[[], asyncio.Protocol]
         """Makes the protocol of a connection, for clients that need no socket."""
@@ -190,11 +195,13 @@ class KubernetesApi:
         return {**body, "status": {"allowed": self.allows(call)}}
 
     async def _carry_out(self, request: web.Request, call: Call) -> web.StreamResponse:
-        body = json.loads(await request.read() or b"{}")
         try:
             if call.subresource == "portforward":
                 self.store.get(call.plural, call.namespace or "", call.name)
                 return await self.forwards.serve(request)
+            if call.verb == "get" and call.subresource in self.subresources:
+                return await self.subresources[call.subresource](request, call)
+            body = json.loads(await request.read() or b"{}")
             answer = web.json_response(self._perform(request, call, body))
         except Failure as failure:
             return _refused(failure)
@@ -213,8 +220,8 @@ class KubernetesApi:
         if call.verb == "get":
             return _as_asked(request, self.store.get(*where))
         if call.verb == "create":
-            if call.plural == "pods" and request.query.get("fieldValidation") == "Strict":
-                strict.check(body)
+            if request.query.get("fieldValidation") == "Strict":
+                strict.check(body, call.plural)
             return self.store.create(*where[:2], body, dry_run=call.dry_run)
         if call.verb == "update":
             return self.store.update(*where, body)

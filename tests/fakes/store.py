@@ -31,10 +31,12 @@ KINDS = {
     "endpointslices": ("discovery.k8s.io/v1", "EndpointSlice"),
     "deployments": ("apps/v1", "Deployment"),
     "poddisruptionbudgets": ("policy/v1", "PodDisruptionBudget"),
+    "jobs": ("batch/v1", "Job"),
+    "rolebindings": ("rbac.authorization.k8s.io/v1", "RoleBinding"),
     "leases": ("coordination.k8s.io/v1", "Lease"),
     "customresourcedefinitions": ("apiextensions.k8s.io/v1", "CustomResourceDefinition"),
 }
-WITH_STATUS = {"fiberpools", "pods"}
+WITH_STATUS = {"fiberpools", "jobs", "pods"}
 EPOCH = datetime.datetime(2026, 1, 1, tzinfo=datetime.UTC)
 _GRACE = 30  # seconds that a pod has to end
 

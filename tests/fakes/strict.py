@@ -6,17 +6,23 @@ import typing
 from collections.abc import Iterator
 from typing import Any
 
+from kubernetes.aio.client.models.v1_job import V1Job
 from kubernetes.aio.client.models.v1_pod import V1Pod
 from pydantic import BaseModel
 
 from fakes.store import Body, Failure
 
+_MODELS = {"pods": ("Pod", V1Pod), "jobs": ("Job", V1Job)}
 
-def check(pod: Body) -> None:
+
+def check(body: Body, plural: str = "pods") -> None:
     """Raise the API server's error for an unknown field."""
-    unknown = ", ".join(f'unknown field "{path}"' for path in unknown_fields(pod))
+    if plural not in _MODELS:
+        return
+    kind, model = _MODELS[plural]
+    unknown = ", ".join(f'unknown field "{path}"' for path in unknown_fields(body, model))
     if unknown:
-        message = 'Pod in version "v1" cannot be handled as a Pod: strict decoding error: '
+        message = f'{kind} in version "v1" cannot be handled as a {kind}: strict decoding error: '
         raise Failure(400, "BadRequest", message + unknown)
 
 

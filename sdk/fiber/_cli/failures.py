@@ -13,7 +13,8 @@ status meaning
 ====== ======================================================================
 
 ``fiber run`` ends with the status of the program.  Its own errors have the status 125, as those of
-``docker run`` have.
+``docker run`` have, except mistakes of the command line.  A program that cannot be started has 126
+or 127, as in a shell, and one whose output nobody reads any longer has 141.
 """
 
 from __future__ import annotations
@@ -52,6 +53,10 @@ class CommandError(Exception):
         return "\n".join(lines)
 
 
+class ProgramEnded(CommandError):
+    """End of a program that ``fiber run`` follows.  Its status is the program's."""
+
+
 def not_found(kind: str, name: str, existing: Iterable[str], where: str) -> CommandError:
     """Return the error for a name that does not exist, with the nearest one that does."""
     names = sorted(existing)
@@ -86,7 +91,7 @@ def explained(doing: str) -> Iterator[None]:
         raise CommandError(
             f"cannot {doing}",
             error.message,
-            "ask an administrator for the role fiber-user in this namespace",
+            "ask an administrator for the roles fiber-user and, for `fiber run`, fiber-runner",
             NO_RIGHT,
         ) from error
     except NotServed as error:

@@ -9,30 +9,37 @@ from __future__ import annotations
 
 import contextlib
 import http.client
-import os
 import signal
-import sys
-import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import TypeVar
 
-from fiber._cli.failures import INTERRUPTED, CommandError
-from fiber._cli.programs import (
-    Launcher,
-    ProgramPod,
-    find_job,
-    find_pod,
-    number_in,
-)
+from fiber._cli import streams
+from fiber._cli.failures import INTERRUPTED, CommandError, ProgramEnded, explained
+from fiber._cli.interrupts import Interrupts
+from fiber._cli.programs import LauncherClient, ProgramPod, number_in, read_pod, stop
 from fiber._cli.session import Session
-from fiber.launcher import DROPPED, EXIT, FAILED, STDERR
-from fiber_api.rest import JOBS, PODS, ApiError, Forbidden, NotFound
+from fiber.launcher import ALIVE, DROPPED, EXIT, FAILED, STDERR
+from fiber_api import names
+from fiber_api.rest import (
+    JOBS,
+    PODS,
+    ApiError,
+    Body,
+    Conflict,
+    Forbidden,
+    NotFound,
+    Transient,
+    Unauthorized,
+)
 
 T = TypeVar("T")
 
 _LOOK_AGAIN = 0.5
 """Seconds between two looks at a pod that does not run yet."""
+
+_QUIET_LOOKS = 4
+"""Looks at a pod that starts, and failed connections, before the user is told."""
 
 _PAUSE_MIN, _PAUSE_MAX = 0.3, 5.0
 """Seconds until the next attempt to connect; growing."""
@@ -40,201 +47,334 @@ _PAUSE_MIN, _PAUSE_MAX = 0.3, 5.0
 _ENDS_WITHIN = 20.0
 """Seconds from the end of a program to the end of its container."""
 
+_BY_CLUSTERS = (128 + signal.SIGKILL, 128 + signal.SIGTERM)
+"""Exit statuses that a program has if the cluster ends it."""
 
-def follow(
-    session: Session,
-    name: str,
-    archive: bytes | None = None,
-    layout: str = "",
-    detach: bool = False,
-) -> int:
-    """Follow the program until it ends; return its exit status.
+_BROKEN = (ApiError, OSError, http.client.HTTPException)
+"""Errors of a connection to the launcher."""
 
-    With an ``archive`` the program is started first.  ``detach``: return once it runs.
+_AGAIN = "start it again; results that it stored on volumes are still there"
+
+_BROKEN_PIPE = 128 + signal.SIGPIPE
+
+
+def start(session: Session, job: Body, archive: bytes, layout: str, *, detach: bool) -> int:
+    """Start the program of a new Job and follow it to its end; return its exit status.
+
+    ``detach``: return once it runs.
     """
-    following = _Following(session, name)
-    with _interrupts(following):
+    following = _Following(session, str(job["metadata"]["name"]), job)
+
+    def act() -> int:
+        following.create(job)
         pod = following.wait_for_pod()
-        if archive is not None:
-            following.start(pod, archive, layout)
-        if detach:
-            print(f"the program {name!r} runs: `fiber run --attach {name}` follows it, and")
-            print(f"`fiber logs {name}` and `fiber stop {name}` look at it and end it")
+        if following.bring(pod, archive, layout, follows=not detach) and detach:
+            following.tell_how_to_follow()
             return 0
         return following.show(pod)
+
+    return _interruptible(following, act)
+
+
+def attach(session: Session, job: Body) -> int:
+    """Follow the program of a Job to its end; return its exit status."""
+    following = _Following(session, str(job["metadata"]["name"]))
+    following.job = job
+    return _interruptible(following, lambda: following.show(following.wait_for_pod()))
+
+
+def _interruptible(following: _Following, act: Callable[[], int]) -> int:
+    try:
+        with Interrupts(following.interrupt) as following.interrupts:
+            return act()
+    except KeyboardInterrupt:
+        following.give_up()
+        raise ProgramEnded(
+            f"the program {following.name!r} was ended", status=INTERRUPTED
+        ) from None
+    except streams.OutputClosed:
+        following.end_without_reader()
+        return _BROKEN_PIPE
 
 
 class _Following:
     """State of one program that is followed."""
 
-    def __init__(self, session: Session, name: str) -> None:
+    def __init__(self, session: Session, name: str, own: Body | None = None) -> None:
         self._session = session
-        self._name = name
+        self.name = name
+        self._own = own
+        """Job that this command makes; None if it only follows."""
+        self.job: Body | None = None
+        """Job as the API server has it."""
         self._position = 0
         """Bytes of output that were shown."""
-        self._said = ""
-        self.pod: ProgramPod | None = None
-        self.interrupted = 0
+        self._said: set[str] = set()
+        self._pod: ProgramPod | None = None
+        self._is_to_end = False
+        """Flag: the user has interrupted the program."""
+        self.interrupts: Interrupts
 
     def say(self, line: str) -> None:
-        """Write a line about the program, once in a row."""
-        if line != self._said:
-            self._said = line
-            print(f"[fiber] {line}", file=sys.stderr, flush=True)
+        """Write a line about the program, once while nothing changes."""
+        if line not in self._said:
+            self._said.add(line)
+            streams.say(f"[fiber] {line}")
+
+    # -- Start
+
+    def create(self, job: Body) -> None:
+        """Make the Job."""
+        path = JOBS.path(self._session.namespace)
+        with explained(f"start the program {self.name!r}"):
+            try:
+                self.job = self._session.api.create(path, job, strict=True)
+            except Conflict as error:
+                self.job = self._made() if error.repeated else None
+                if self.job is None:
+                    raise CommandError(
+                        f"there is a program {self.name!r} already",
+                        "a program that has ended keeps its name for an hour",
+                        f"choose another name, or `fiber stop {self.name}`",
+                    ) from error
+
+    def _made(self) -> Body | None:
+        """Return the Job of this name if it is the one that this command makes."""
+        assert self._own is not None
+        found = self._session.api.get(self._path, timeout=5.0)
+        ours = self._own["metadata"]["annotations"][names.ANNOTATION_RUN]
+        theirs = (found["metadata"].get("annotations") or {}).get(names.ANNOTATION_RUN)
+        return found if ours == theirs else None
+
+    @property
+    def _path(self) -> str:
+        return JOBS.path(self._session.namespace, self.name)
 
     def wait_for_pod(self) -> ProgramPod:
         """Return the program's pod once it runs or has ended."""
-        began = time.monotonic()
+        looks = 0
         while True:
-            pod = find_pod(self._session, self._name)
-            if pod is not None and (pod.runs or pod.exit_status is not None):
-                self.pod = pod
-                return pod
-            self._check_job()
-            if time.monotonic() - began > 2.0:
-                where = "no pod yet" if pod is None else f"its pod {pod.state}"
-                self.say(f"waiting for the program {self._name!r}: {where}")
+            with explained(f"wait for the pod of {self.name!r}"):
+                try:
+                    pod = read_pod(self._session, self.name)
+                    if pod is not None and (pod.runs or pod.has_ended):
+                        self._pod = pod
+                        return pod
+                    if pod is None:
+                        self._check_job(self._read_job())
+                    state = "no pod yet" if pod is None else f"its pod {pod.state}"
+                except Transient as error:
+                    state = f"the API server does not answer ({error.message})"
+            looks += 1
+            if looks > _QUIET_LOOKS:
+                self.say(f"waiting for the program {self.name!r}: {state}")
             time.sleep(_LOOK_AGAIN)
 
-    def _check_job(self) -> None:
+    def _check_job(self, job: Body) -> None:
         """Raise CommandError if the Job will make no pod."""
-        job = find_job(self._session, self._name)
-        for condition in (job.get("status") or {}).get("conditions") or ():
-            if condition.get("type") == "Failed" and condition.get("status") == "True":
-                raise CommandError(
-                    f"the program {self._name!r} did not start",
-                    str(condition.get("message") or condition.get("reason")),
-                    f"see `kubectl describe job {self._name} -n {self._session.namespace}`",
-                    FAILED,
-                )
+        if not job:
+            raise self._deleted(FAILED)
+        self._raise_if_overdue(job, FAILED)
+        over = _condition(job, "Failed") or _condition(job, "Complete")
+        if over:
+            raise CommandError(
+                f"the program {self.name!r} has no pod"
+                + (" any longer" if over["type"] == "Complete" else ""),
+                " ".join(str(over.get("message") or over.get("reason") or "it ended").split()),
+                f"see `kubectl describe job {self.name} -n {self._session.namespace}`",
+            )
 
-    def start(self, pod: ProgramPod, archive: bytes, layout: str) -> None:
-        """Bring the files of the program to its pod."""
-        self._repeat(lambda: Launcher(self._session, pod.name).start(archive, layout))
+    def _read_job(self) -> Body:
+        """Return the Job; empty if it is gone."""
+        try:
+            return self._session.api.get(self._path, timeout=5.0)
+        except NotFound:
+            return {}
+
+    def bring(self, pod: ProgramPod, archive: bytes, layout: str, *, follows: bool) -> bool:
+        """Bring the files of the program to its pod; return whether it has started."""
+        launcher = LauncherClient(self._session, pod.name)
+        try:
+            failure = self._repeat(lambda: launcher.start(archive, layout, follows=follows))
+        except CommandError:
+            self.give_up()  # nobody else would bring them
+            raise
+        return failure == ""
+
+    def tell_how_to_follow(self) -> None:
+        """Write the program's name to the output, and what to do with it."""
+        streams.write(f"{self.name}\n".encode())
+        self.say(f"`fiber run --attach {self.name}` follows the program, `fiber logs {self.name}`")
+        self.say(f"shows its output, and `fiber stop {self.name}` ends it")
+
+    # -- Output
 
     def show(self, pod: ProgramPod) -> int:
         """Show the output until the program ends; return its exit status."""
+        self.interrupts.is_armed = True
         status = self._repeat(lambda: self._show_from_here(pod)) if pod.runs else None
-        return self._ended() if status is None else status
+        if status is None:
+            return self._show_end()
+        if status in _BY_CLUSTERS:
+            self._explain(status)
+        return status
 
     def _show_from_here(self, pod: ProgramPod) -> int:
-        for kind, data in Launcher(self._session, pod.name).output(self._position):
+        for kind, data in LauncherClient(self._session, pod.name).output(self._position):
             if kind == EXIT:
                 return number_in(kind, data)
             if kind == DROPPED:
                 dropped = number_in(kind, data)
                 self._position += dropped
                 self.say(
-                    f"{dropped} bytes of output came while nothing followed the program; "
-                    f"`fiber logs {self._name}` has them"
+                    f"{dropped} bytes of output came while nothing took them; "
+                    f"`fiber logs {self.name}` has them, unless they are too old"
                 )
-            else:
-                self._write(kind, data)
+            elif kind != ALIVE:
+                streams.write(data, to_stderr=kind == STDERR)
+                self._position += len(data)
+                self._said.clear()
         raise ConnectionResetError("the connection to the program's pod broke")
-
-    def _write(self, kind: int, data: bytes) -> None:
-        stream = sys.stderr if kind == STDERR else sys.stdout
-        stream.flush()
-        view = memoryview(data)
-        while view:
-            view = view[os.write(stream.fileno(), view) :]
-        self._position += len(data)
 
     def _repeat(self, act: Callable[[], T]) -> T | None:
         """Call ``act`` until no connection breaks; return None if the program's pod has ended."""
-        pause = _PAUSE_MIN
+        pause, failures = _PAUSE_MIN, 0
         while True:
-            try:
-                return act()
-            except Forbidden as error:
-                raise CommandError(
-                    f"cannot follow the program {self._name!r}",
-                    error.message,
-                    "ask an administrator for the role fiber-user in this namespace",
-                    FAILED,
-                ) from error
-            except (ApiError, OSError, http.client.HTTPException) as error:
-                trouble = str(error)
-            with contextlib.suppress(CommandError):  # the API server does not answer
-                self.pod = find_pod(self._session, self._name)
-                if self.pod is None or not self.pod.runs:
+            position = self._position
+            with explained(f"follow the program {self.name!r}"):
+                try:
+                    return act()
+                except (Forbidden, Unauthorized):
+                    raise
+                except _BROKEN as error:
+                    trouble = " ".join(str(error).split())
+                if self._is_over():
                     return None
-            self.say(f"the connection to the program broke ({trouble}); trying again")
+            if self._position > position:
+                pause, failures = _PAUSE_MIN, 0
+            failures += 1
+            if failures > _QUIET_LOOKS:
+                self.say(f"no connection to the program ({trouble}); trying again")
             time.sleep(pause)
             pause = min(2 * pause, _PAUSE_MAX)
 
-    def _ended(self) -> int:
+    def _is_over(self) -> bool:
+        """Return whether the pod is known to have ended."""
+        try:
+            self._pod = read_pod(self._session, self.name)
+        except Transient:
+            return False
+        return self._pod is None or self._pod.has_ended or self._pod.is_lost
+
+    # -- End
+
+    def _show_end(self) -> int:
         """Show what the log has beyond the output that was shown; return the exit status."""
-        pod = self._end_of_pod()
-        if pod is None:
-            raise CommandError(
-                f"the program {self._name!r} was lost",
-                "its pod was deleted, or its node is gone",
-                "start it again; results that it stored on volumes are still there",
-                FAILED,
-            )
-        self._show_log(pod)
-        if pod.disaster:
-            raise CommandError(
-                f"the program {self._name!r} was ended by the cluster",
-                pod.disaster,
-                "start it again, with more --memory if that was too little",
-                pod.exit_status or FAILED,
-            )
-        return FAILED if pod.exit_status is None else pod.exit_status
+        with explained(f"find out how the program {self.name!r} ended"):
+            pod = self._end_of_pod()
+            if pod is not None:
+                self._show_log(pod)
+            status = None if pod is None else pod.exit_status
+            self._raise_if_disaster(pod, FAILED if status is None else status)
+        return FAILED if status is None else status
+
+    def _explain(self, status: int) -> None:
+        """Raise ProgramEnded if the program has this exit status because of the cluster."""
+        with contextlib.suppress(ApiError):  # the status is known
+            self._raise_if_disaster(self._end_of_pod(), status)
 
     def _end_of_pod(self) -> ProgramPod | None:
+        """Return the pod once it has ended; None if it is gone."""
         deadline = time.monotonic() + _ENDS_WITHIN
-        while time.monotonic() < deadline:
-            pod = find_pod(self._session, self._name)
-            if pod is None or pod.exit_status is not None or pod.phase in ("Failed", "Succeeded"):
-                return pod
+        while not self._is_over() and time.monotonic() < deadline:
             time.sleep(_LOOK_AGAIN)
-        return find_pod(self._session, self._name)
+        return self._pod
+
+    def _raise_if_disaster(self, pod: ProgramPod | None, status: int) -> None:
+        """Raise ProgramEnded if the cluster has ended the program."""
+        job = self._read_job()
+        self._raise_if_overdue(job, status)
+        if not job:
+            raise self._deleted(status)
+        if pod is None:
+            raise ProgramEnded(
+                f"the program {self.name!r} was lost",
+                "its pod was deleted, or its node is gone",
+                _AGAIN,
+                status,
+            )
+        if reason := "its node does not answer" if pod.is_lost else pod.disaster:
+            raise ProgramEnded(
+                f"the program {self.name!r} was ended by the cluster",
+                reason,
+                "start it again, with more --memory" if "OOMKilled" in reason else _AGAIN,
+                status,
+            )
+
+    def _deleted(self, status: int) -> ProgramEnded:
+        what = f"the program {self.name!r} was deleted"
+        return ProgramEnded(what, "its Job is gone, as after `fiber stop --now`", _AGAIN, status)
+
+    def _raise_if_overdue(self, job: Body, status: int) -> None:
+        """Raise ProgramEnded if the program has reached its longest run time."""
+        for kind in ("Failed", "FailureTarget"):
+            if _condition(job, kind).get("reason") == "DeadlineExceeded":
+                seconds = (job.get("spec") or {}).get("activeDeadlineSeconds")
+                raise ProgramEnded(
+                    f"the program {self.name!r} was ended by its deadline",
+                    f"it had not ended {seconds} s after its start",
+                    "start it again with a longer --timeout, or without one",
+                    status,
+                )
 
     def _show_log(self, pod: ProgramPod) -> None:
         seen = self._position
         path = PODS.path(self._session.namespace, pod.name)
         with contextlib.suppress(ApiError):  # the log may be gone with its node
-            for piece in self._session.api.log(path, {}):
+            for piece in self._session.api.log(path, {"container": names.PROGRAM_CONTAINER}):
                 if seen < len(piece):
-                    sys.stdout.flush()
-                    os.write(sys.stdout.fileno(), piece[seen:])
+                    streams.write(piece[seen:])
                 seen = max(seen - len(piece), 0)
+        if seen:
+            self.say("the last output may be missing: the log does not have it")
 
-    # -- Ctrl-C
+    # -- Ctrl-C and other ends of this command
 
     def interrupt(self) -> None:
-        """Interrupt the program; the second time end it."""
-        self.interrupted += 1
-        if self.interrupted == 1 and self.pod is not None:
-            self.say("interrupting the program; Ctrl-C again ends it")
-            self._in_background(lambda pod: Launcher(self._session, pod).signal(signal.SIGINT))
-        else:
-            self.say("ending the program")
-            stop(self._session, self._name)
-            raise CommandError(f"the program {self._name!r} was ended", status=INTERRUPTED)
+        """Interrupt the program, from another thread."""
+        self._is_to_end = True
+        self.say("interrupting the program; Ctrl-C again ends it")
+        try:
+            self._signal(signal.SIGINT)
+        except _BROKEN as error:
+            self.say(f"the program was not interrupted ({error}); Ctrl-C again ends it")
 
-    def _in_background(self, act: Callable[[str], None]) -> None:
-        pod = self.pod.name if self.pod else ""
+    def _signal(self, number: int) -> None:
+        if self._pod is not None:
+            LauncherClient(self._session, self._pod.name).signal(number)
 
-        def run() -> None:
-            with contextlib.suppress(ApiError, OSError):
-                act(pod)
+    def give_up(self) -> None:
+        """Delete the Job, if this command has made it or the user has interrupted it before."""
+        try:
+            job = self.job or (self._made() if self._own else None)
+            if job is not None and (self._own or self._is_to_end):
+                self.say("ending the program")
+                stop(self._session, job)
+        except NotFound:
+            pass
+        except ApiError as error:
+            self.say(f"cannot end the program ({error.message}): `fiber stop {self.name} --now`")
 
-        threading.Thread(target=run, name="fiber-interrupt", daemon=True).start()
+    def end_without_reader(self) -> None:
+        """End a program that this command has started, as its closed output would here."""
+        if self._own is not None:
+            with contextlib.suppress(*_BROKEN):
+                self._signal(signal.SIGTERM)
 
 
-def stop(session: Session, name: str) -> None:
-    """Delete the Job of a program, and with it its pod."""
-    with contextlib.suppress(NotFound):
-        session.api.delete(JOBS.path(session.namespace, name), timeout=5.0)
-
-
-@contextlib.contextmanager
-def _interrupts(following: _Following) -> Iterator[None]:
-    before = signal.signal(signal.SIGINT, lambda *_: following.interrupt())
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
+def _condition(job: Body, kind: str) -> Body:
+    """Return a condition of the Job that is true; empty if there is none."""
+    for condition in (job.get("status") or {}).get("conditions") or ():
+        if condition.get("type") == kind and condition.get("status") == "True":
+            return dict(condition)
+    return {}

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-import os
 import re
-import sys
 
 import click
 
+from fiber._cli import streams
 from fiber._cli.failures import USAGE, CommandError, explained, not_found
-from fiber._cli.programs import find_job, find_pod
-from fiber._cli.ps import host_of
+from fiber._cli.log_following import follow_log
+from fiber._cli.programs import SECONDS, find_job, find_pod
+from fiber._cli.ps import host_of, list_pools
 from fiber._cli.session import Session, cluster_options, connect
 from fiber_api import names
-from fiber_api.rest import PODS, POOLS, NotFound
+from fiber_api.rest import PODS, NotFound
 
 _UNITS = {"s": 1, "m": 60, "h": 3600, "d": 86_400}
+_BROKEN_PIPE = 141
 
 
 @click.command("logs")
@@ -31,7 +32,7 @@ def command(
     since: str | None,
     namespace: str | None,
     context: str | None,
-) -> None:
+) -> int:
     """Show the output of a program that `fiber run` started, or of a worker.
 
     A program that has ended keeps its log for an hour.
@@ -41,19 +42,34 @@ def command(
       fiber logs train-4f2a1 --follow
       fiber logs train-4f2a1 --worker train-1c0de-9e107d9d37 --since 5m
     """
-    query = {"follow": "true"} if follow else {}
+    container = names.WORKER_CONTAINER if worker else names.PROGRAM_CONTAINER
+    query = {"container": container}
     if since is not None:
         query["sinceSeconds"] = str(_seconds(since))
     session = connect(context, namespace)
     find_job(session, name)
     pod = _worker(session, name, worker) if worker else _pod(session, name)
-    with explained(f"read the log of {pod}"):
-        try:
+    try:
+        with explained(f"read the log of {pod}"):
+            _show(session, pod, query, follow)
+    except streams.OutputClosed:
+        return _BROKEN_PIPE
+    return 0
+
+
+def _show(session: Session, pod: str, query: dict[str, str], follow: bool) -> None:
+    try:
+        if follow:
+            follow_log(session, pod, query)
+        else:
             for piece in session.api.log(PODS.path(session.namespace, pod), query):
-                sys.stdout.flush()
-                os.write(sys.stdout.fileno(), piece)
-        except NotFound as error:
-            raise CommandError(f"there is no pod {pod!r} any longer", error.message) from error
+                streams.write(piece)
+    except NotFound as error:
+        raise CommandError(
+            f"there is no pod {pod!r} any longer",
+            error.message,
+            f"see `kubectl get pods -n {session.namespace}` for those that there are",
+        ) from error
 
 
 def _pod(session: Session, program: str) -> str:
@@ -79,18 +95,18 @@ def workers_of(session: Session, program: str) -> list[str]:
     """Return the names of the pods of a program's workers."""
     host = _pod(session, program)
     with explained("list the workers"):
-        pools = session.api.list(POOLS.path(session.namespace), timeout=5.0).get("items") or ()
+        pools = list_pools(session)
         uids = [str(pool["metadata"]["uid"]) for pool in pools if host_of(pool) == host]
         found: list[str] = []
         for uid in uids:
             selector = {"labelSelector": f"{names.LABEL_POOL_UID}={uid}"}
-            listing = session.api.list(PODS.path(session.namespace), selector, timeout=5.0)
+            listing = session.api.list(PODS.path(session.namespace), selector, timeout=SECONDS)
             found += [str(pod["metadata"]["name"]) for pod in listing.get("items") or ()]
     return found
 
 
 def _seconds(text: str) -> int:
-    found = re.fullmatch(r"(\d+)([smhd])", text)
+    found = re.fullmatch(r"([0-9]{1,9})([smhd])", text)
     if found is None or not int(found[1]):
         raise CommandError(
             f"{text!r} is no time", "--since needs a number and a unit", "--since 5m", USAGE

@@ -6,6 +6,7 @@ Each command is imported when it is used, so that ``fiber --help`` answers at on
 from __future__ import annotations
 
 import importlib
+import os
 import sys
 from typing import TYPE_CHECKING
 
@@ -20,6 +21,7 @@ _COMMANDS = {
     "pool": "List, make and scale FiberPools.",
     "doctor": "Find out why programs do not get workers.",
     "image": "Build an image for workers from this environment.",
+    "completion": "Print the script that completes words in a shell.",
 }
 """Names of the commands, and their help in one line.  Each has a module of its name."""
 
@@ -51,7 +53,10 @@ def main() -> None:
         print("fiber: interrupted", file=sys.stderr)
         sys.exit(INTERRUPTED)
     except BrokenPipeError:  # the reader of a pipe, such as head, has enough
-        sys.stderr.close()
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # the interpreter flushes it at the end
+        sys.exit(1)
+    except OSError as error:  # for example, the working directory is gone
+        print(f"fiber: the command failed\n  why:  {error}", file=sys.stderr)
         sys.exit(1)
     sys.exit(status if isinstance(status, int) else 0)
 

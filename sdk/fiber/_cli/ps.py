@@ -9,24 +9,23 @@ import click
 
 from fiber._cli import display
 from fiber._cli.failures import explained
-from fiber._cli.programs import list_jobs
+from fiber._cli.programs import SECONDS, list_jobs
 from fiber._cli.session import Session, cluster_options, connect, output_option
 from fiber_api import names
-from fiber_api.rest import PODS, POOLS, Body
+from fiber_api.rest import PODS, POOLS, Body, NotServed
 from fiber_api.times import parse_time
 
-_SECONDS = 5.0
-_COLUMNS = ["name", "state", "workers", "runs in", "age", "command"]
+_COLUMNS = ["name", "state", "workers", "host", "age", "command"]
 
 
 @click.command("ps")
 @cluster_options
 @output_option
 def command(namespace: str | None, context: str | None, output: str) -> None:
-    """List the programs that run in a namespace, and their workers.
+    """List the programs of a namespace, and their workers.
 
-    Programs that `fiber run` started are in pods.  Other programs are listed by the FiberPools that
-    they use.
+    Programs that `fiber run` started are in pods, and those that have ended are listed for an hour.
+    Other programs are listed by the FiberPools that they use.
 
     \b
     Examples:
@@ -34,27 +33,28 @@ def command(namespace: str | None, context: str | None, output: str) -> None:
       fiber ps --namespace team-a --output json
     """
     session = connect(context, namespace)
-    rows = [*_of_jobs(session), *_elsewhere(session)]
+    jobs, pools = list_jobs(session), list_pools(session)
+    hosts = _hosts(session) if jobs else {}
+    rows = [*_of_jobs(jobs, pools, hosts), *_elsewhere(pools, jobs, hosts)]
     display.show(rows, _COLUMNS, output, f"no program runs in {session.where}")
     if output == "table" and any(row["state"] == "running" and row["job"] for row in rows):
         click.echo("`fiber run --attach NAME` follows one again", err=True)
 
 
-def _of_jobs(session: Session) -> list[dict[str, Any]]:
-    """Return a row for each program that ``fiber run`` has started."""
-    workers = _workers(session)
-    return [
-        {
-            "name": job["metadata"]["name"],
-            "state": state_of_job(job),
-            "workers": workers[str(job["metadata"]["name"])],
-            "runs in": "pod",
-            "age": display.age(parse_time(job["metadata"]["creationTimestamp"])),
-            "command": (job["metadata"].get("annotations") or {}).get(names.ANNOTATION_COMMAND),
-            "job": True,
-        }
-        for job in list_jobs(session)
-    ]
+def list_pools(session: Session) -> list[Body]:
+    """Return the FiberPools of the namespace; none if the cluster does not know them."""
+    with explained("list the FiberPools"):
+        try:
+            listing = session.api.list(POOLS.path(session.namespace), timeout=SECONDS)
+        except NotServed:
+            return []
+    return list(listing.get("items") or ())
+
+
+def host_of(pool: Body) -> str:
+    """Return the host of a pool's master: the first part of its identity."""
+    identity = str((pool["spec"].get("master") or {}).get("identity", ""))
+    return identity.partition(":")[0]
 
 
 def state_of_job(job: Body) -> str:
@@ -66,57 +66,70 @@ def state_of_job(job: Body) -> str:
     return "running" if status.get("ready") else "starting"
 
 
-def _pools(session: Session) -> list[Body]:
-    with explained("list the FiberPools"):
-        return list(
-            session.api.list(POOLS.path(session.namespace), timeout=_SECONDS).get("items") or ()
-        )
-
-
-def _workers(session: Session) -> Counter[str]:
-    """Return the number of ready workers of each program in a pod."""
+def _hosts(session: Session) -> dict[str, str]:
+    """Return the program of each pod that has one.  A pod's name is the host of its program."""
     with explained("list the pods of programs"):
         listing = session.api.list(
             PODS.path(session.namespace),
             {"labelSelector": names.LABEL_PROGRAM},
-            timeout=_SECONDS,
+            timeout=SECONDS,
         )
-    programs = {
+    pods = sorted(
+        listing.get("items") or (), key=lambda pod: str(pod["metadata"]["creationTimestamp"])
+    )
+    return {
         str(pod["metadata"]["name"]): str(pod["metadata"]["labels"][names.LABEL_PROGRAM])
-        for pod in listing.get("items") or ()
+        for pod in pods
     }
-    found: Counter[str] = Counter()
-    for pool in _pools(session):
-        if (program := programs.get(host_of(pool))) is not None:
-            found[program] += int((pool.get("status") or {}).get("readyReplicas") or 0)
-    return found
 
 
-def host_of(pool: Body) -> str:
-    """Return the host of a pool's master: the first part of its identity."""
-    identity = str((pool["spec"].get("master") or {}).get("identity", ""))
-    return identity.partition(":")[0]
-
-
-def _elsewhere(session: Session) -> list[dict[str, Any]]:
-    """Return a row for each program that is in no pod of ``fiber run``, by its FiberPools."""
-    jobs = {str(job["metadata"]["name"]) for job in list_jobs(session)}
+def _of_jobs(jobs: list[Body], pools: list[Body], hosts: dict[str, str]) -> list[dict[str, Any]]:
+    """Return a row for each program that ``fiber run`` has started."""
+    workers: Counter[str] = Counter()
+    for pool in pools:
+        if (program := hosts.get(host_of(pool))) is not None:
+            workers[program] += _ready(pool)
+    newest = {program: pod for pod, program in hosts.items()}
     rows = []
-    for pool in _pools(session):
-        identity = (pool["spec"].get("master") or {}).get("identity")
-        if identity is None or any(host_of(pool).startswith(f"{job}-") for job in jobs):
-            continue
-        status = pool.get("status") or {}
-        alive = {c["type"]: c["status"] for c in status.get("conditions") or ()}
-        rows.append(
-            {
-                "name": pool["metadata"]["name"],
-                "state": "lost" if alive.get("MasterAlive") == "False" else "running",
-                "workers": status.get("readyReplicas") or 0,
-                "runs in": host_of(pool),
-                "age": display.age(parse_time(pool["metadata"]["creationTimestamp"])),
-                "command": None,
-                "job": False,
-            }
-        )
+    for job in jobs:
+        metadata = job["metadata"]
+        name = str(metadata["name"])
+        typed = (metadata.get("annotations") or {}).get(names.ANNOTATION_COMMAND)
+        rows.append(_row(job, state_of_job(job), workers[name], newest.get(name), typed, job=True))
     return rows
+
+
+def _elsewhere(pools: list[Body], jobs: list[Body], hosts: dict[str, str]) -> list[dict[str, Any]]:
+    """Return a row for each pool of a program that ``fiber run`` has not started."""
+    programs = {str(job["metadata"]["name"]) for job in jobs}
+    rows = []
+    for pool in pools:
+        host = host_of(pool)
+        if not host or hosts.get(host) in programs:
+            continue
+        conditions = (pool.get("status") or {}).get("conditions") or ()
+        alive = {condition["type"]: condition["status"] for condition in conditions}
+        state = "lost" if alive.get("MasterAlive") == "False" else "running"
+        rows.append(_row(pool, state, _ready(pool), host, None, job=False))
+    return rows
+
+
+def _ready(pool: Body) -> int:
+    return int((pool.get("status") or {}).get("readyReplicas") or 0)
+
+
+def _row(
+    body: Body, state: str, workers: int, host: str | None, typed: str | None, *, job: bool
+) -> dict[str, Any]:
+    """Return the facts of a program.  The keys are for programs, too, and stay."""
+    created = str(body["metadata"]["creationTimestamp"])
+    return {
+        "name": body["metadata"]["name"],
+        "state": state,
+        "workers": workers,
+        "host": host,
+        "created": created,
+        "age": display.age(parse_time(created)),
+        "command": None if typed is None else " ".join(typed.split()),
+        "job": job,
+    }

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import http.client
 import signal
 
 import click
 
-from fiber._cli import following
 from fiber._cli.failures import explained
-from fiber._cli.programs import Launcher, find_job, find_pod
-from fiber._cli.session import cluster_options, connect
+from fiber._cli.programs import LauncherClient, ProgramPod, find_job, find_pod, stop
+from fiber._cli.session import Session, cluster_options, connect
 from fiber_api.rest import ApiError
 
 
@@ -29,16 +29,21 @@ def command(name: str, now: bool, namespace: str | None, context: str | None) ->
       fiber stop train-4f2a1 --now
     """
     session = connect(context, namespace)
-    find_job(session, name)
+    job = find_job(session, name)
     pod = find_pod(session, name)
-    if not now and pod is not None and pod.runs:
-        try:
-            Launcher(session, pod.name).signal(signal.SIGTERM)
-        except (ApiError, OSError):
-            now = True  # the pod does not answer
-    if now or pod is None or not pod.runs:
-        with explained(f"end the program {name!r}"):
-            following.stop(session, name)
-        click.echo(f"deleted the program {name!r}")
-    else:
+    if not now and pod is not None and pod.runs and _ask_to_end(session, pod):
         click.echo(f"asked the program {name!r} to end")
+        return
+    with explained(f"end the program {name!r}"):
+        stop(session, job)
+    click.echo(f"deleted the program {name!r}")
+
+
+def _ask_to_end(session: Session, pod: ProgramPod) -> bool:
+    """Send SIGTERM, and return whether the pod has got it."""
+    try:
+        LauncherClient(session, pod.name).signal(signal.SIGTERM)
+    except (ApiError, OSError, http.client.HTTPException) as error:
+        click.echo(f"fiber: the program's pod does not answer: {error}", err=True)
+        return False
+    return True

@@ -202,7 +202,12 @@ _SECRET = re.compile(
 
 def _is_secret(variable: Mapping[str, Any]) -> bool:
     """Return whether the variable has a value in the manifest, and the name of a secret."""
-    return bool(variable.get("value")) and _SECRET.search(variable["name"]) is not None
+    return bool(variable.get("value")) and names_secret(variable["name"])
+
+
+def names_secret(name: str) -> bool:
+    """Return whether a variable of this name looks like a secret."""
+    return _SECRET.search(name) is not None
 
 
 def _given(document: Document, fields: tuple[str, ...]) -> Document:
