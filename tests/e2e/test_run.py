@@ -185,5 +185,5 @@ def test_a_program_that_needs_too_much_memory_is_told_so(person: Person) -> None
 def test_an_account_without_rights_is_told_which(person: Person) -> None:
     done = person.runs("run", "count.py")
     assert done.returncode == 125, done.stderr
-    assert "serviceaccounts" in done.stderr
+    assert "fiber-program" in done.stderr
     assert "--service-account" in done.stderr

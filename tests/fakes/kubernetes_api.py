@@ -196,11 +196,11 @@ class KubernetesApi:
 
     async def _carry_out(self, request: web.Request, call: Call) -> web.StreamResponse:
         try:
+            if call.verb == "get" and call.subresource in self.subresources:
+                return await self.subresources[call.subresource](request, call)
             if call.subresource == "portforward":
                 self.store.get(call.plural, call.namespace or "", call.name)
                 return await self.forwards.serve(request)
-            if call.verb == "get" and call.subresource in self.subresources:
-                return await self.subresources[call.subresource](request, call)
             body = json.loads(await request.read() or b"{}")
             answer = web.json_response(self._perform(request, call, body))
         except Failure as failure:

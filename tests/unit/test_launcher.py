@@ -284,7 +284,9 @@ def test_a_command_that_cannot_be_run(site: Site, command: str, status: int, wor
 
 
 @pytest.mark.parametrize(
-    "files", [b"", b"no archive", gzip.compress(b"no archive"), archive(**{"../out": ""})]
+    "files",
+    [b"", b"no archive", gzip.compress(b"no archive"), archive(**{"../out": ""})],
+    ids=["empty", "no archive", "no tar", "a file outside"],
 )
 def test_a_bad_archive_ends_the_pod(site: Site, files: bytes) -> None:
     pod = site.pod("true")
