@@ -96,10 +96,15 @@ class Pod:
         position: int = 0,
         until: bytes | None = None,
         told: Callable[[], object] = lambda: None,
+        begun: Callable[[], object] = lambda: None,
     ) -> Records:
-        """Read the output to its end, or until it contains these bytes; tell of each record."""
+        """Read the output to its end, or until it contains these bytes; tell of each record.
+
+        ``begun`` is called once the pod knows this reader, and so waits for it at its end.
+        """
         found: Records = []
         with self.ask("GET", f"/output/{position}") as response:
+            begun()
             while not found or found[-1][0] != EXIT:
                 kind, length = RECORD.unpack(response.read(RECORD.size))
                 found.append((kind, response.read(length)))
@@ -187,8 +192,9 @@ def test_output_without_a_newline_is_there_at_once(site: Site) -> None:
         "import signal, sys\nsys.stdout.write('abc'); sys.stdout.flush(); signal.pause()"
     )
     assert pod.read(until=b"abc")
-    assert pod.signal(signal.SIGTERM) == 200
-    assert status_in(pod.read()) == 143
+    answers: list[int] = []
+    found = pod.read(begun=lambda: answers.append(pod.signal(signal.SIGTERM)))
+    assert (answers, status_in(found)) == ([200], 143)
 
 
 def test_a_program_may_close_its_output(site: Site) -> None:
@@ -229,8 +235,7 @@ def test_two_readers_get_everything(site: Site) -> None:
 def test_a_reader_goes_on_where_another_broke_off(site: Site) -> None:
     pod = site.python("import signal\nprint('one', flush=True)\nsignal.pause()")
     seen = text(pod.read(until=b"on"))
-    pod.signal(signal.SIGTERM)
-    rest = pod.read(len(seen))
+    rest = pod.read(len(seen), begun=lambda: pod.signal(signal.SIGTERM))
     assert seen + text(rest) == b"one\n"
     assert status_in(rest) == 143
 
@@ -373,8 +378,7 @@ def test_an_interrupt_reaches_the_group(site: Site) -> None:
     child = f"{sys.executable} -c 'import signal; print(1, flush=True); signal.pause()'"
     pod = site.shell(f"trap 'echo shell' INT; {child}; exit 4")
     pod.read(until=b"1")
-    pod.signal(signal.SIGINT)
-    found = pod.read()
+    found = pod.read(begun=lambda: pod.signal(signal.SIGINT))
     assert text(found) == b"1\nshell\n"
     assert b"KeyboardInterrupt" in text(found, STDERR)
     assert status_in(found) == 4
@@ -390,8 +394,8 @@ def test_the_status_of_a_program_that_a_signal_ends(site: Site, number: int) -> 
 def test_the_end_of_the_pod_is_passed_on(site: Site) -> None:
     pod = site.python("import signal\nprint(1, flush=True)\nsignal.pause()")
     pod.read(until=b"1")
-    pod.launched.process.send_signal(signal.SIGTERM)
-    assert status_in(pod.read()) == pod.end() == 143
+    found = pod.read(begun=lambda: pod.launched.process.send_signal(signal.SIGTERM))
+    assert status_in(found) == pod.end() == 143
 
 
 def test_a_pod_without_a_program_ends_at_once(site: Site) -> None:
