@@ -509,7 +509,7 @@ def test_pods_that_cannot_reach_the_program_are_an_error(
     monkeypatch.setattr("fiber._backends.kubernetes.waiting.DOUBTED_AFTER", 0.2)
     monkeypatch.setattr("fiber._backends.kubernetes.waiting.GIVEN_UP_AFTER", 0.5)
     cluster.nodes.cut_off = True
-    with running(backend="kubernetes"):
+    with running(backend="kubernetes", relay="never"):
         for _ in range(2):  # the second waits for the same pods
             with fiber.Pool(2) as pool, pytest.raises(FiberPoolError) as caught:
                 pool.map(square, range(3))
