@@ -41,6 +41,10 @@ _LOOK_AGAIN = 0.5
 _QUIET_LOOKS = 4
 """Looks at a pod that starts, and failed connections, before the user is told."""
 
+_REFUSED = 30.0
+"""Seconds for which a right or a login may be missing that was there before.  A starting API server
+refuses everything for a while."""
+
 _PAUSE_MIN, _PAUSE_MAX = 0.3, 5.0
 """Seconds until the next attempt to connect; growing."""
 
@@ -109,6 +113,8 @@ class _Following:
         """Job as the API server has it."""
         self._position = 0
         """Bytes of output that were shown."""
+        self._was_served = False
+        """True once the API server has led this command to the pod."""
         self._said: set[str] = set()
         self._pod: ProgramPod | None = None
         self._is_to_end = False
@@ -239,18 +245,27 @@ class _Following:
     def _repeat(self, act: Callable[[], T]) -> T | None:
         """Call ``act`` until no connection breaks; return None if the program's pod has ended."""
         pause, failures = _PAUSE_MIN, 0
+        refused: float | None = None
         while True:
             position = self._position
             with explained(f"follow the program {self.name!r}"):
                 try:
-                    return act()
-                except (Forbidden, Unauthorized):
-                    raise
+                    found = act()
+                except (Forbidden, Unauthorized) as error:
+                    refused = time.monotonic() if refused is None else refused
+                    if not self._was_served or time.monotonic() - refused > _REFUSED:
+                        raise
+                    trouble = error.message
                 except _BROKEN as error:
+                    refused = None
                     trouble = " ".join(str(error).split())
+                else:
+                    self._was_served = True
+                    return found
                 if self._is_over():
                     return None
             if self._position > position:
+                self._was_served = True
                 pause, failures = _PAUSE_MIN, 0
             failures += 1
             if failures > _QUIET_LOOKS:
@@ -262,7 +277,7 @@ class _Following:
         """Return whether the pod is known to have ended."""
         try:
             self._pod = read_pod(self._session, self.name)
-        except Transient:
+        except (Transient, Forbidden, Unauthorized):
             return False
         return self._pod is None or self._pod.has_ended or self._pod.is_lost
 
