@@ -51,6 +51,19 @@ def test_an_api_server_that_fails_for_a_while_does_not_matter(site: Site) -> Non
     assert site.fiber("run", "train.py") == Outcome(0, NUMBERS, "")
 
 
+@pytest.mark.parametrize("status", [401, 403])
+def test_an_api_server_that_starts_and_refuses_everything_does_not_matter(
+    site: Site, status: int
+) -> None:
+    site.write("train.py", "print(*range(20_000), sep='\\n')")
+    site.nodes.cuts = [10_000_000, 1000]
+    site.server.api.faults += [
+        Fault("get", "pods", status, times=3, skip=1),
+        Fault("list", "pods", status, times=2, skip=1),
+    ]
+    assert site.fiber("run", "train.py") == Outcome(0, NUMBERS, "")
+
+
 def test_much_output_is_shown_whole(site: Site) -> None:
     site.write("train.py", "for n in range(40): print(chr(65 + n) * (1 << 20))")
     outcome = site.fiber("run", "train.py")
