@@ -377,7 +377,7 @@ def test_a_port_that_is_taken(tmp_path: Path) -> None:
 def test_an_interrupt_reaches_the_group(site: Site) -> None:
     child = f"{sys.executable} -c 'import signal; print(1, flush=True); signal.pause()'"
     pod = site.shell(f"trap 'echo shell' INT; {child}; exit 4")
-    pod.read(until=b"1")
+    pod.read(until=b"1\n")
     found = pod.read(begun=lambda: pod.signal(signal.SIGINT))
     assert text(found) == b"1\nshell\n"
     assert b"KeyboardInterrupt" in text(found, STDERR)
