@@ -233,11 +233,15 @@ def test_two_readers_get_everything(site: Site) -> None:
 
 
 def test_a_reader_goes_on_where_another_broke_off(site: Site) -> None:
-    pod = site.python("import signal\nprint('one', flush=True)\nsignal.pause()")
-    seen = text(pod.read(until=b"on"))
-    rest = pod.read(len(seen), begun=lambda: pod.signal(signal.SIGTERM))
-    assert seen + text(rest) == b"one\n"
-    assert status_in(rest) == 143
+    pod = site.python(
+        "import os, signal\n"
+        "signal.signal(signal.SIGTERM, lambda *_: (os.write(1, b'two'), os._exit(9)))\n"
+        "os.write(1, b'one')\n"
+        "while True: signal.pause()"
+    )
+    assert text(pod.read(until=b"one")) == b"one"
+    rest = pod.read(3, begun=lambda: pod.signal(signal.SIGTERM))
+    assert (text(rest), status_in(rest)) == (b"two", 9)
 
 
 # ---- start
