@@ -11,8 +11,7 @@ import time
 from collections.abc import Iterator
 
 from fiber._cli import streams
-from fiber._cli.programs import SECONDS
-from fiber._cli.session import Session
+from fiber._cli.session import SECONDS, Session
 from fiber_api.rest import PODS, Invalid, Transient
 
 _PAUSE = 1.0

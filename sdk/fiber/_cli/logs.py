@@ -9,7 +9,7 @@ import click
 from fiber._cli import streams
 from fiber._cli.failures import USAGE, CommandError, explained, not_found
 from fiber._cli.log_following import follow_log
-from fiber._cli.programs import SECONDS, find_job, find_pod
+from fiber._cli.programs import find_job, find_pod
 from fiber._cli.ps import host_of, list_pools
 from fiber._cli.session import Session, cluster_options, connect
 from fiber_api import names
@@ -99,9 +99,8 @@ def workers_of(session: Session, program: str) -> list[str]:
         uids = [str(pool["metadata"]["uid"]) for pool in pools if host_of(pool) == host]
         found: list[str] = []
         for uid in uids:
-            selector = {"labelSelector": f"{names.LABEL_POOL_UID}={uid}"}
-            listing = session.api.list(PODS.path(session.namespace), selector, timeout=SECONDS)
-            found += [str(pod["metadata"]["name"]) for pod in listing.get("items") or ()]
+            pods = session.items(PODS, f"{names.LABEL_POOL_UID}={uid}")
+            found += [str(pod["metadata"]["name"]) for pod in pods]
     return found
 
 

@@ -9,13 +9,10 @@ from typing import Any
 import click
 
 from fiber._cli.failures import CommandError, explained, not_found
-from fiber._cli.session import Session, connect
+from fiber._cli.session import SECONDS, Session, connect
 from fiber_api import names
 from fiber_api.names import ConditionType
 from fiber_api.rest import POOLS, Body, Conflict, Invalid, NotFound
-
-TIMEOUT = 5.0
-"""Seconds for one call."""
 
 _ATTEMPTS = 20
 """Attempts to change a pool whose status the operator writes meanwhile."""
@@ -36,8 +33,7 @@ def path_of(session: Session, name: str) -> str:
 def pools(session: Session) -> list[Body]:
     """Return the FiberPools of the namespace."""
     with explained("list the FiberPools"):
-        listing = session.api.list(POOLS.path(session.namespace), timeout=TIMEOUT)
-    return list(listing.get("items") or ())
+        return session.items(POOLS)
 
 
 def absent(session: Session, name: str) -> CommandError:
@@ -50,7 +46,7 @@ def find(session: Session, name: str) -> Body | None:
     """Return a FiberPool; None if there is none of this name."""
     with explained(f"read the FiberPool {name!r}"):
         try:
-            return session.api.get(path_of(session, name), timeout=TIMEOUT)
+            return session.api.get(path_of(session, name), timeout=SECONDS)
         except NotFound:
             return None
 
@@ -92,7 +88,7 @@ def change(session: Session, name: str, spec_of: Callable[[Body], Body], doing: 
 def _send(session: Session, name: str, body: Body) -> Body:
     try:
         return session.api.merge_patch(
-            path_of(session, name), body, manager=names.COMMAND_MANAGER, timeout=TIMEOUT
+            path_of(session, name), body, manager=names.COMMAND_MANAGER, timeout=SECONDS
         )
     except NotFound:
         raise absent(session, name) from None

@@ -8,8 +8,8 @@ from typing import Any, TextIO
 import click
 
 from fiber._cli.failures import CommandError
-from fiber._cli.pool_access import TIMEOUT, find, one_line, opened, path_of, refusals
-from fiber._cli.session import Session, cluster_options
+from fiber._cli.pool_access import find, one_line, opened, path_of, refusals
+from fiber._cli.session import SECONDS, Session, cluster_options
 from fiber_api import names
 from fiber_api.rest import Body, Conflict, NotFound
 
@@ -46,7 +46,7 @@ def _apply(session: Session, document: Body, file: str, force: bool) -> None:
     body.pop("status", None)
     with refusals(doing):
         try:
-            session.api.apply_manifest(path_of(session, name), body, force=force, timeout=TIMEOUT)
+            session.api.apply_manifest(path_of(session, name), body, force=force, timeout=SECONDS)
         except Conflict as error:
             raise _conflict(doing, error) from error
         except NotFound as error:

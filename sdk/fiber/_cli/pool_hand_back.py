@@ -8,7 +8,6 @@ import click
 
 from fiber._cli.failures import CommandError, explained
 from fiber._cli.pool_access import (
-    TIMEOUT,
     absent,
     account_of_program,
     change,
@@ -18,7 +17,7 @@ from fiber._cli.pool_access import (
     path_of,
     program_of,
 )
-from fiber._cli.session import Session, cluster_options
+from fiber._cli.session import SECONDS, Session, cluster_options
 from fiber_api.rest import Body, Conflict, NotFound
 
 _yes = click.option("-y", "--yes", is_flag=True, help="Do not ask for a confirmation.")
@@ -97,7 +96,7 @@ def delete(name: str, yes: bool, namespace: str | None, context: str | None) -> 
 def _delete(session: Session, name: str, uid: str) -> None:
     with explained(f"delete the FiberPool {name!r}"):
         try:
-            session.api.delete(path_of(session, name), uid=uid, timeout=TIMEOUT)
+            session.api.delete(path_of(session, name), uid=uid, timeout=SECONDS)
             return
         except (Conflict, NotFound):
             pass  # it is gone, and perhaps there is another one of its name

@@ -11,7 +11,7 @@ import click
 from fiber._backends.kubernetes.problems import node_of, pod_end
 from fiber._cli import display
 from fiber._cli.failures import explained
-from fiber._cli.pool_access import TIMEOUT, account_of_program, get, one_line, opened, program_of
+from fiber._cli.pool_access import account_of_program, get, one_line, opened, program_of
 from fiber._cli.session import Session, cluster_options, output_option
 from fiber_api import names
 from fiber_api.rest import PODS, Body
@@ -117,10 +117,8 @@ def _waits_for(status: Body) -> str:
 
 
 def _pods(session: Session, pool: Body) -> list[Body]:
-    selector = {"labelSelector": f"{names.LABEL_POOL_UID}={pool['metadata']['uid']}"}
     with explained("list the pods of the FiberPool"):
-        found = session.api.list(PODS.path(session.namespace), selector, timeout=TIMEOUT)
-    return list(found.get("items") or ())
+        return session.items(PODS, f"{names.LABEL_POOL_UID}={pool['metadata']['uid']}")
 
 
 def _lines(pool: Body, pods: list[dict[str, Any]]) -> Iterator[str]:

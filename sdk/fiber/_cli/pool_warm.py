@@ -13,7 +13,6 @@ from fiber import config, resources
 from fiber._backends.kubernetes.template import PodShape, merge_template, pod_template, quantity
 from fiber._cli.failures import CommandError, explained
 from fiber._cli.pool_access import (
-    TIMEOUT,
     change,
     find,
     is_of_program,
@@ -21,7 +20,7 @@ from fiber._cli.pool_access import (
     program_of,
     refusals,
 )
-from fiber._cli.session import Session, cluster_options
+from fiber._cli.session import SECONDS, Session, cluster_options
 from fiber.resources import GPU, Resources
 from fiber_api import names
 from fiber_api.rest import POOLS, Body, Conflict
@@ -96,7 +95,7 @@ def _made(session: Session, name: str, workers: int, image: str | None, wishes: 
         try:
             body = _body(_checked_name(name), workers, image, wishes)
             path = POOLS.path(session.namespace)
-            session.api.create(path, body, strict=True, timeout=TIMEOUT)
+            session.api.create(path, body, strict=True, timeout=SECONDS)
         except Conflict:
             return False
     return True

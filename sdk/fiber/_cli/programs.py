@@ -17,7 +17,7 @@ from fiber._backends.kubernetes.problems import pod_end
 from fiber._backends.kubernetes.relay_client import state_of
 from fiber._cli.failures import explained, not_found
 from fiber._cli.forward import open_socket
-from fiber._cli.session import Session
+from fiber._cli.session import SECONDS, Session
 from fiber.launcher import (
     ALIVE,
     DROPPED,
@@ -33,9 +33,6 @@ from fiber.launcher import (
 from fiber_api import names
 from fiber_api.rest import JOBS, PODS, Body, Conflict, NotFound
 from fiber_api.times import parse_time
-
-SECONDS = 5.0
-"""Seconds that the API server may take."""
 
 _SILENCE = 3 * HEARTBEAT
 """Seconds without a byte after which a connection counts as broken."""
@@ -118,10 +115,8 @@ def find_job(session: Session, name: str) -> Body:
 
 def list_jobs(session: Session) -> list[Body]:
     """Return the Jobs of all programs of the namespace."""
-    selector = {"labelSelector": names.LABEL_PROGRAM}
     with explained("list the programs"):
-        listing = session.api.list(JOBS.path(session.namespace), selector, timeout=SECONDS)
-    return list(listing.get("items") or ())
+        return session.items(JOBS, names.LABEL_PROGRAM)
 
 
 def find_pod(session: Session, program: str) -> ProgramPod | None:
@@ -132,9 +127,7 @@ def find_pod(session: Session, program: str) -> ProgramPod | None:
 
 def read_pod(session: Session, program: str) -> ProgramPod | None:
     """Return the newest pod of a program as ``find_pod`` does; ``ApiError``."""
-    selector = {"labelSelector": f"{names.LABEL_PROGRAM}={program}"}
-    listing = session.api.list(PODS.path(session.namespace), selector, timeout=SECONDS)
-    pods = listing.get("items") or []
+    pods = session.items(PODS, f"{names.LABEL_PROGRAM}={program}")
     if not pods:
         return None
     newest = max(pods, key=lambda pod: str(pod["metadata"]["creationTimestamp"]))

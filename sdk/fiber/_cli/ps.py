@@ -9,7 +9,7 @@ import click
 
 from fiber._cli import display
 from fiber._cli.failures import explained
-from fiber._cli.programs import SECONDS, list_jobs
+from fiber._cli.programs import list_jobs
 from fiber._cli.session import Session, cluster_options, connect, output_option
 from fiber_api import names
 from fiber_api.rest import PODS, POOLS, Body, NotServed
@@ -45,10 +45,9 @@ def list_pools(session: Session) -> list[Body]:
     """Return the FiberPools of the namespace; none if the cluster does not know them."""
     with explained("list the FiberPools"):
         try:
-            listing = session.api.list(POOLS.path(session.namespace), timeout=SECONDS)
+            return session.items(POOLS)
         except NotServed:
             return []
-    return list(listing.get("items") or ())
 
 
 def host_of(pool: Body) -> str:
@@ -69,14 +68,8 @@ def state_of_job(job: Body) -> str:
 def _hosts(session: Session) -> dict[str, str]:
     """Return the program of each pod that has one.  A pod's name is the host of its program."""
     with explained("list the pods of programs"):
-        listing = session.api.list(
-            PODS.path(session.namespace),
-            {"labelSelector": names.LABEL_PROGRAM},
-            timeout=SECONDS,
-        )
-    pods = sorted(
-        listing.get("items") or (), key=lambda pod: str(pod["metadata"]["creationTimestamp"])
-    )
+        found = session.items(PODS, names.LABEL_PROGRAM)
+    pods = sorted(found, key=lambda pod: str(pod["metadata"]["creationTimestamp"]))
     return {
         str(pod["metadata"]["name"]): str(pod["metadata"]["labels"][names.LABEL_PROGRAM])
         for pod in pods

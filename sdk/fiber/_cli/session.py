@@ -10,8 +10,13 @@ import click
 from fiber import config
 from fiber._backends.kubernetes.api import Api
 from fiber._cli.failures import explained
+from fiber_api.rest import Body, ResourceType
 
 F = TypeVar("F", bound=Callable[..., Any])
+
+
+SECONDS = 5.0
+"""Seconds that the API server may take for a call."""
 
 
 class Session(NamedTuple):
@@ -24,6 +29,12 @@ class Session(NamedTuple):
     def where(self) -> str:
         """Namespace and cluster, for messages."""
         return f"the namespace {self.namespace!r} of the cluster at {self.api.server}"
+
+    def items(self, kind: ResourceType, labels: str = "") -> list[Body]:
+        """Return the namespace's objects of a kind, with these labels; ``ApiError``."""
+        selector = {"labelSelector": labels} if labels else {}
+        listing = self.api.list(kind.path(self.namespace), selector, timeout=SECONDS)
+        return list(listing.get("items") or ())
 
 
 def connect(context: str | None, namespace: str | None) -> Session:

@@ -7,7 +7,8 @@ bytes of each agent in a stream of its own over the master's connection (``multi
 
 The relay has no credentials.  TLS, proofs and sealed messages pass through it unread, so that a
 relay in wrong hands can delay and break connections only.  ``master_port`` listens on the loopback
-of the pod alone: whoever reaches it may open a port-forward to the pod or run commands in it.
+of the pod alone.  To reach it, an account needs the right to open port-forwards to the pod or to
+run commands in it.
 
 While there is no master, agents wait here, up to the bounds of ``Admission``.  They give up
 and connect again by themselves.
