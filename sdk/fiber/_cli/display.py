@@ -35,6 +35,11 @@ def table(rows: Sequence[Sequence[str]], columns: Sequence[str]) -> str:
     )
 
 
+def utc(seconds: float) -> str:
+    """Return a unix time as Kubernetes writes it."""
+    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(seconds))
+
+
 def age(since: float | None) -> str:
     """Return how long ago a unix time was, as kubectl writes it; empty for None."""
     if since is None:
