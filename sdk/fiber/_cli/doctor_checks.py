@@ -20,7 +20,7 @@ from fiber._cli.doctor_rights import (
     SPEC_OF_PROGRAMS,
     Right,
 )
-from fiber._cli.doctor_verdicts import State, Verdict, fault, ok, unknown
+from fiber._cli.doctor_verdicts import State, Verdict, fault, note, ok, unknown
 from fiber._cli.pool_access import account_of_program, condition, is_of_program, program_of
 from fiber.config import Config
 from fiber.errors import ConfigError
@@ -304,7 +304,7 @@ def _special_rights(facts: Facts) -> Iterator[Verdict]:
 
 
 def _run_rights(facts: Facts) -> Iterator[Verdict]:
-    yield from _rights(facts, RUN_RIGHTS, "`fiber run`")
+    yield from _rights(facts, RUN_RIGHTS, "only `fiber run`")
 
 
 def _rights(facts: Facts, wanted: Sequence[Right], who: str) -> Iterator[Verdict]:
@@ -314,8 +314,9 @@ def _rights(facts: Facts, wanted: Sequence[Right], who: str) -> Iterator[Verdict
         yield unknown(f"the API server does not say which rights this account has{why}")
         return
     missing = [right for right in wanted if not facts.rights.get(right, True)]
+    judge = note if wanted is RUN_RIGHTS else fault
     for right in missing:
-        yield fault(
+        yield judge(
             f"this account may not {right}",
             f"{right.only or who} needs this in the namespace {facts.place.namespace!r}",
             _remedy(facts.place.namespace, wanted),
@@ -340,7 +341,7 @@ def _account(facts: Facts) -> Iterator[Verdict]:
     missing = [str(right) for right in ACCOUNT_RIGHTS if not rights.get(right, True)]
     match facts.account:
         case NotFound() if missing:
-            yield fault(
+            yield note(
                 f"there is no account {name!r}, as which `fiber run` runs programs",
                 f"this account may not make it: it may not {', nor '.join(missing)}",
                 f"ask an administrator: `kubectl create serviceaccount {name} -n {namespace}` and "
