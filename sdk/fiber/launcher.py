@@ -121,12 +121,14 @@ class Output:
                 self._changed.notify_all()
 
     def add(self, kind: int, data: bytes) -> None:
-        """Add output.  Waits for readers that would lose output, while they take some."""
+        """Add output.  Waits for readers that would lose output, while they come and take some."""
         with self._changed:
             self._append(kind, data)
             self._changed.notify_all()
             while self._is_full():
                 if self._is_awaited() and self._wait_for_progress():
+                    continue
+                if self._wait_for_first_reader():
                     continue
                 self._begin += len(self._pieces.popleft()[1])
 
@@ -146,6 +148,13 @@ class Output:
         """Return whether a reader has not got the oldest piece."""
         oldest = self._begin + len(self._pieces[0][1])
         return any(position < oldest for position in self._positions.values())
+
+    def _wait_for_first_reader(self) -> bool:
+        """Wait for an expected reader if there is none, and return whether one came."""
+        left = self._expected_until - time.monotonic()
+        if self._positions or left <= 0:
+            return False
+        return self._changed.wait_for(lambda: bool(self._positions), left)
 
     def _wait_for_progress(self) -> bool:
         """Wait until a reader gets on, and return whether one did; leave the slowest behind."""
@@ -172,6 +181,7 @@ class Output:
         reader = object()
         with self._changed:
             self._positions[reader] = position
+            self._changed.notify_all()
         try:
             yield self._records(reader, position, heartbeat)
         except BaseException:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import gzip
 import http.client
@@ -20,6 +21,7 @@ from pathlib import Path
 import pytest
 
 from fakes.program_nodes import Launched, kill
+from faults.program import wait_for
 from fiber.launcher import (
     ALIVE,
     DROPPED,
@@ -504,8 +506,14 @@ def test_without_readers_old_output_is_dropped() -> None:
     assert rest[-2] == (STDERR, b"J" * 100)
 
 
-def test_the_program_waits_for_a_reader_that_takes_its_output() -> None:
+@pytest.mark.parametrize("reader", ["there", "expected", "broken off"])
+def test_the_program_waits_for_a_reader_that_takes_its_output(reader: str) -> None:
     output = Output(kept=1500, linger=3600)
+    if reader == "expected":
+        output.expect_reader()
+    elif reader == "broken off":
+        with pytest.raises(ConnectionError), output.reading(0):
+            raise ConnectionError
 
     def write() -> None:
         for number in range(100):
@@ -513,8 +521,13 @@ def test_the_program_waits_for_a_reader_that_takes_its_output() -> None:
         output.end(0)
 
     writer = threading.Thread(target=write)
-    with output.reading(0) as records:
+    with contextlib.ExitStack() as stack:
+        if reader == "there":
+            records = stack.enter_context(output.reading(0))
         writer.start()
+        if reader != "there":
+            wait_for(lambda: output._end >= 500)  # and that is too much to keep
+            records = stack.enter_context(output.reading(0))
         found = split(b"".join(records))
     writer.join()
     assert not text(found, DROPPED)
