@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import fiber
+from fiber._cli.display import counted
 from fiber._cli.doctor_capacity import refusing_quota, refusing_range, requests_of, room
 from fiber._cli.doctor_facts import Answer, Facts, FirstAnswer, NoPlace, Place
 from fiber._cli.doctor_rights import (
@@ -392,8 +393,8 @@ def _quota(facts: Facts) -> Iterator[Verdict]:
     if unread and not (full or outside):
         yield unknown(f"this account may not list the {' and '.join(unread)} of the namespace")
     elif not (full or outside):
-        number = f"{len(quotas or ())} quotas and {len(ranges or ())} LimitRanges"
-        yield ok(f"{number}, none refuses a worker")
+        both = counted(len(quotas or ()), "quota"), counted(len(ranges or ()), "LimitRange")
+        yield ok(f"{' and '.join(both)}, none refuses a worker")
 
 
 def _nodes(facts: Facts) -> Iterator[Verdict]:
@@ -469,7 +470,7 @@ def _objection(wanted: str | None, pools: Mapping[str, Body]) -> Verdict | None:
 def _use(pool: Body) -> str:
     ready = (pool.get("status") or {}).get("readyReplicas") or 0
     use = "free" if program_of(pool) is None else f"used by {account_of_program(pool)}"
-    return f"{ready} workers ready, {use}"
+    return f"{counted(ready, 'worker')} ready, {use}"
 
 
 def _list(answer: Answer | None) -> list[Body] | None:
