@@ -595,3 +595,39 @@ def test_the_end_waits_for_a_reader_that_broke_off_to_come_again() -> None:
     waiter.start()
     assert text(records_of(output)) == b"out"
     waiter.join()
+
+
+# ---- monitors
+
+
+WATCHED = """
+import os
+from fiber._monitor.server import MonitorServer
+from fiber._transport.loop import Loop
+
+folder = os.environ["TMPDIR"] + "/fiber-watched"
+os.mkdir(folder, 0o700)
+loop = Loop()
+server = MonitorServer(loop, folder, lambda request: [{"answer": request}])
+print("listens", flush=True)
+loop.run()
+"""
+
+
+def test_a_question_is_passed_on_to_the_programs_monitor(
+    site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    pod = site.python(WATCHED)
+    pod.read(until=b"listens")
+    question = {"Content_Length": "16"}
+    with pod.ask("POST", "/monitor", b'{"ask": "stack"}', **question) as response:
+        answers = [json.loads(line) for line in response]
+    assert {"answer": {"ask": "stack"}} in answers
+
+
+@pytest.mark.parametrize("size", ["70000", "-1", "many"])
+def test_a_question_that_cannot_be_is_refused(site: Site, size: str) -> None:
+    pod = site.pod("true")
+    with pod.ask("POST", "/monitor", b"nonsense", Content_Length=size) as response:
+        assert response.status == 400
