@@ -19,6 +19,8 @@ It is configured by its environment:
                             ``Fiber-Follows`` a reader of the output is going to come.  The answer
                             has the header ``Fiber-Failure`` if the program could not be started
 ``GET /output/POSITION``    the records of the output from that position on, until the end
+``POST /monitor``           ask the monitors of the program's processes (``fiber._monitor``); the
+                            body is the request, and the answer has the lines of them all
 ``POST /signal/NUMBER``     send a signal to the program, or end if it does not run yet
 
 A record of the output has a head of a byte and four bytes: what it is, and its length.  0 says that
@@ -54,6 +56,7 @@ from http.server import BaseHTTPRequestHandler
 from typing import IO, Any
 
 from fiber._agent.zygote import unpack
+from fiber._monitor import client
 
 FAILED, NOT_EXECUTABLE, NO_COMMAND = 125, 126, 127
 ALIVE, STDOUT, STDERR, DROPPED, EXIT = range(5)
@@ -79,6 +82,9 @@ and the pod's log has what is dropped for the others."""
 _PIECE = 64 << 10
 _BATCH = 256 << 10
 """Bytes after which records are sent."""
+
+_LONGEST_QUESTION = 1 << 16
+"""Bytes of a request to a monitor."""
 
 _PIECE_COST = 256
 """Bytes that a piece of output takes beside its contents, or a little more."""
@@ -126,9 +132,7 @@ class Output:
             self._append(kind, data)
             self._changed.notify_all()
             while self._is_full():
-                if self._is_awaited() and self._wait_for_progress():
-                    continue
-                if self._wait_for_first_reader():
+                if (self._is_awaited() and self._wait_for_progress()) or self._wait_for_reader():
                     continue
                 self._begin += len(self._pieces.popleft()[1])
 
@@ -149,7 +153,7 @@ class Output:
         oldest = self._begin + len(self._pieces[0][1])
         return any(position < oldest for position in self._positions.values())
 
-    def _wait_for_first_reader(self) -> bool:
+    def _wait_for_reader(self) -> bool:
         """Wait for an expected reader if there is none, and return whether one came."""
         left = self._expected_until - time.monotonic()
         if self._positions or left <= 0:
@@ -450,6 +454,30 @@ class _Handler(BaseHTTPRequestHandler):
                 self._answer_start(self._launcher.failure)
 
     def do_POST(self) -> None:
+        if self.path == "/monitor":
+            self._ask_monitors()
+        else:
+            self._send_signal()
+
+    def _ask_monitors(self) -> None:
+        try:
+            request = json.loads(self.rfile.read(self._question_size()))
+        except ValueError:
+            self.send_error(400)
+            return
+        self._answer()
+        for path in client.sockets():
+            with contextlib.suppress(client.NoAnswer):
+                for line in client.ask(path, request):
+                    self.wfile.write(json.dumps(line).encode() + b"\n")
+
+    def _question_size(self) -> int:
+        size = int(self.headers.get("Content-Length", "none"))
+        if not 0 <= size <= _LONGEST_QUESTION:
+            raise ValueError(size)
+        return size
+
+    def _send_signal(self) -> None:
         number = self._number()
         if number not in signal.valid_signals():
             self.send_error(400)
@@ -512,8 +540,7 @@ class _Handler(BaseHTTPRequestHandler):
 def _pass_on_signals(launcher: ProgramLauncher) -> None:
     """Pass on signals to the program, on a thread.
 
-    Python calls handlers on the main thread only, between two steps.  A signal that comes just
-    before the main thread waits would have no effect until the wait is over.
+    Python's handlers run on the main thread, between two steps: not while that waits.
     """
     received, wake = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
     os.set_blocking(received, True)

@@ -273,6 +273,14 @@ def test_a_large_archive(site: Site) -> None:
     assert text(pod.read()) == b"%d\n" % (16 << 20)
 
 
+def test_output_that_is_no_text_arrives_unchanged(site: Site) -> None:
+    """An archive of results can be the output of a program."""
+    program = "import sys; sys.stdout.buffer.write(bytes(range(256)) * 4096)"
+    pod = site.pod(sys.executable, "-c", program)
+    pod.start()
+    assert text(pod.read()) == bytes(range(256)) * 4096
+
+
 @pytest.mark.parametrize(
     ("command", "status", "words"),
     [

@@ -40,6 +40,11 @@ def counted(number: int, noun: str) -> str:
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
+def utc(seconds: float) -> str:
+    """Return a unix time as Kubernetes writes it."""
+    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(seconds))
+
+
 def age(since: float | None) -> str:
     """Return how long ago a unix time was, as kubectl writes it; empty for None."""
     if since is None:
