@@ -132,9 +132,7 @@ class Output:
             self._append(kind, data)
             self._changed.notify_all()
             while self._is_full():
-                if self._is_awaited() and self._wait_for_progress():
-                    continue
-                if self._wait_for_first_reader():
+                if (self._is_awaited() and self._wait_for_progress()) or self._wait_for_reader():
                     continue
                 self._begin += len(self._pieces.popleft()[1])
 
@@ -155,7 +153,7 @@ class Output:
         oldest = self._begin + len(self._pieces[0][1])
         return any(position < oldest for position in self._positions.values())
 
-    def _wait_for_first_reader(self) -> bool:
+    def _wait_for_reader(self) -> bool:
         """Wait for an expected reader if there is none, and return whether one came."""
         left = self._expected_until - time.monotonic()
         if self._positions or left <= 0:
@@ -542,8 +540,7 @@ class _Handler(BaseHTTPRequestHandler):
 def _pass_on_signals(launcher: ProgramLauncher) -> None:
     """Pass on signals to the program, on a thread.
 
-    Python calls handlers on the main thread only, between two steps.  A signal that comes just
-    before the main thread waits would have no effect until the wait is over.
+    Python's handlers run on the main thread, between two steps: not while that waits.
     """
     received, wake = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
     os.set_blocking(received, True)

@@ -73,7 +73,7 @@ class Launched:
 
     @property
     def log(self) -> bytes:
-        """What the pod has written, without the line about the port."""
+        """Log of the pod, without the line about the port."""
         first, rest = self._lines()
         return rest if first.startswith(LISTENS) else first.encode() + rest
 

@@ -146,8 +146,9 @@ def test_the_log_of_a_program_is_the_file_that_it_writes_to(
     assert following.stdout.readline() == b"begun\n"
     outcome = run("logs", name, "--since", "5m")
     program.process.kill()
-    assert following.communicate(timeout=PATIENCE) == (b"", None)
-    assert following.returncode == 0
+    assert following.stdout.read() == b""
+    following.stdout.close()
+    assert following.wait(PATIENCE) == 0
     assert outcome.status == 2
     assert "--since is for programs in pods" in outcome.err
 

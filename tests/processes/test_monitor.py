@@ -13,6 +13,7 @@ import fiber
 from census import wait_until
 from faults import pool_targets as tasks
 from fiber._monitor import client
+from fiber.pool import Pool
 from patience import PATIENCE
 
 pytestmark = pytest.mark.usefixtures("backend")
@@ -32,12 +33,12 @@ def stack_of(worker: str) -> str:
 
 
 @pytest.fixture
-def pool() -> Iterator[fiber.Pool]:
+def pool() -> Iterator[Pool]:
     with fiber.Pool(1) as pool:
         yield pool
 
 
-def test_a_worker_that_hangs_in_native_code_shows_its_stack_and_goes_on(pool: fiber.Pool) -> None:
+def test_a_worker_that_hangs_in_native_code_shows_its_stack_and_goes_on(pool: Pool) -> None:
     pool.apply_async(tasks.hang_in_native_code)
     assert wait_until(lambda: pool.workers()[0].state == "busy", PATIENCE)
     (worker,) = pool.workers()
@@ -48,14 +49,14 @@ def test_a_worker_that_hangs_in_native_code_shows_its_stack_and_goes_on(pool: fi
     assert [info.pid for info in pool.workers()] == [worker.pid]
 
 
-def test_an_idle_worker_shows_that_it_waits(pool: fiber.Pool) -> None:
+def test_an_idle_worker_shows_that_it_waits(pool: Pool) -> None:
     assert pool.apply(abs, (-1,)) == 1
     (worker,) = pool.workers()
     assert wait_until(lambda: "waits for work" in stack_of(worker.name), PATIENCE)
     assert pool.apply(abs, (-2,)) == 2
 
 
-def test_a_stopped_worker_is_said_to_be_stopped(pool: fiber.Pool) -> None:
+def test_a_stopped_worker_is_said_to_be_stopped(pool: Pool) -> None:
     pool.apply(abs, (-1,))
     (worker,) = pool.workers()
     assert worker.pid is not None
@@ -67,7 +68,7 @@ def test_a_stopped_worker_is_said_to_be_stopped(pool: fiber.Pool) -> None:
     assert pool.apply(abs, (-2,)) == 2
 
 
-def test_all_children_and_the_program_show_their_stacks(pool: fiber.Pool) -> None:
+def test_all_children_and_the_program_show_their_stacks(pool: Pool) -> None:
     pool.apply(abs, (-1,))
     process = fiber.Process(target=tasks.hang_in_python, name="hangs")
     process.start()
@@ -84,13 +85,13 @@ def test_all_children_and_the_program_show_their_stacks(pool: fiber.Pool) -> Non
     assert [line["child"]["state"] for line in ask(ask="children")] == ["idle"]
 
 
-def test_an_unknown_worker_is_said_to_be_unknown(pool: fiber.Pool) -> None:
+def test_an_unknown_worker_is_said_to_be_unknown(pool: Pool) -> None:
     pool.apply(abs, (-1,))
     (line,) = ask(ask="stacks", worker="nobody")
     assert line["unknown"] == "nobody"
     assert line["names"] == [pool.workers()[0].name]
 
 
-def test_an_unknown_question_is_an_error(pool: fiber.Pool) -> None:
+def test_an_unknown_question_is_an_error(pool: Pool) -> None:
     (line,) = ask(ask="weather")
     assert "no answer to 'weather'" in line["error"]

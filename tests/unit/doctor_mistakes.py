@@ -22,7 +22,11 @@ from fiber_api import names
 from fiber_api.names import Reason
 from unit.kubernetes_rig import NAMESPACE, OTHER, pool_body
 
-ANSWER = {"python": "3.11.2", "fiber": Program("", "").fiber, "packages": 7}
+ANSWER = {
+    "python": "3.11.2",
+    "fiber": Program("", "").fiber,
+    "packages": ["fiberpool", "NumPy", "ruamel.yaml"],
+}
 SIDES = {"ours": "3.99.1", "theirs": "3.11.7", "peer": "laptop-7"}
 POOL = PoolName("doctor-trial-1", NAMESPACE)
 
@@ -306,7 +310,7 @@ MISTAKES = [
         ),
         "trial",
         "'mine:1' lacks Fiber",
-        "fiber image",
+        "fiber image build",
         ("--image", "mine:1"),
     ),
     Mistake(
@@ -314,7 +318,7 @@ MISTAKES = [
         _fails(Reason.BACKOFF_LIMIT_EXCEEDED, 'exec: "python": executable file not found in $PATH'),
         "trial",
         "lacks Fiber, or Python",
-        "fiber image",
+        "fiber image build",
     ),
     Mistake(
         "image that crashes",
@@ -330,14 +334,16 @@ MISTAKES = [
         "runs as root",
         "USER",
     ),
-    Mistake("other Python", _refused(python="3.99.1"), "trial", "another Python", "fiber image"),
+    Mistake(
+        "other Python", _refused(python="3.99.1"), "trial", "another Python", "fiber image build"
+    ),
     Mistake("other Fiber", _refused(protocol=0), "trial", "another Fiber", "fiber image"),
     Mistake(
         "agent that ends because of another Python",
         _ends(Reason.CONTAINER_FAILED, f"Its last lines:\n{VersionMismatch('Python', **SIDES)}"),
         "trial",
         "another Python",
-        "fiber image",
+        "fiber image build",
     ),
     Mistake("NetworkPolicy", _cut_off("a-relay"), "trial", "nor its relay", "NetworkPolicy"),
     Mistake("no relay wanted", _cut_off(""), "trial", "do not reach this program", "FIBER_RELAY"),

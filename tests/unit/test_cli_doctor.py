@@ -26,6 +26,7 @@ from fiber._cli.doctor_rights import (
     SPEC_OF_PROGRAMS,
     Right,
 )
+from fiber._cli.image_packages import Package
 from fiber_api import names
 from unit.doctor_mistakes import ANSWER, MISTAKES, DoctorRig, Mistake
 from unit.kubernetes_rig import NAMESPACE, OTHER, Body, kubeconfig, pool_body
@@ -40,6 +41,7 @@ def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[DoctorRig]:
         monkeypatch.chdir(tmp_path)
         made = DoctorRig(DoctorCluster(server, NAMESPACE), tmp_path, monkeypatch, server.api.url)
         monkeypatch.setattr(doctor, "attempt", made.attempt)
+        packages_of(monkeypatch, "fiberpool")
         yield made
 
 
@@ -157,6 +159,24 @@ def test_the_way_of_the_worker_is_said(rig: DoctorRig) -> None:
 def test_another_fiber_that_works_is_a_fault(rig: DoctorRig) -> None:
     rig.course.answer = {**ANSWER, "fiber": "0.0.1"}
     assert "the image has Fiber 0.0.1" in first_fault(verdicts())["what"]
+
+
+def packages_of(patch: pytest.MonkeyPatch, *names: str) -> None:
+    """Let this program have these packages."""
+    patch.setattr(doctor, "installed", lambda: [Package(name, "1") for name in names])
+
+
+def test_packages_that_the_image_lacks_are_a_note(
+    rig: DoctorRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    packages_of(monkeypatch, "fiberpool", "numpy", "ruamel_yaml", "pip", *"gfedcba")
+    (found,) = [verdict for verdict in verdicts() if verdict["state"] == "note"]
+    words = "the image lacks 7 packages of this program: a, b, c, d, e and 2 more"
+    assert (found["check"], found["what"]) == ("trial", words)
+    assert "fiber image build" in found["do"]
+    assert run("doctor").status == 0
+    packages_of(monkeypatch, "numpy", "scipy")
+    assert "the image lacks 1 package of this program: scipy\n" in run("doctor").out
 
 
 # ---- rights

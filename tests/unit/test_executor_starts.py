@@ -126,7 +126,7 @@ def test_a_workers_complaint_is_the_users_error() -> None:
     results = rig.call()
     for _ in range(60):
         handle = rig.handles[-1]
-        rig.say(handle, work.INIT_FAILED, "no such device")
+        rig.say(handle, work.INIT_FAILED, "no such device", "")
         handle.exited(ExitReport(1, "exit status 1"))
         rig.loop.pass_time(1.0)
         rig.background.run()

@@ -111,7 +111,7 @@ def may_stay(pool: FiberPool, existing: Mapping[str, Any], wanted: Mapping[str, 
 def is_observed(existing: Mapping[str, Any]) -> bool:
     """Return True if the cluster has acted on the Deployment as it is."""
     generation = mapping(existing, "metadata").get("generation")
-    return mapping(existing, "status").get("observedGeneration", 0) == generation
+    return bool(mapping(existing, "status").get("observedGeneration", 0) == generation)
 
 
 def refusal(existing: Mapping[str, Any]) -> str:

@@ -23,12 +23,10 @@ from fiber._hub import client as hub_client
 from fiber._hub.protocol import HubAddress
 from fiber._transport.channels import UnixChannel
 from fiber._wire.descriptor import Descriptor, contents, own
+from fiber._worker_images import INSTALLED, missing_module
 
 _LONGEST_LINE = 1 << 16
 """Bytes of one line that are buffered before they are written."""
-
-_INSTALLED = ("site-packages", "dist-packages")
-"""Folders of installed packages."""
 
 _PR_SET_PDEATHSIG = 1
 _PR_SET_CHILD_SUBREAPER = 36
@@ -203,10 +201,10 @@ def _load_and_run(
         is_worker = _task_channel is not None
         _tell(f"{'' if is_worker else f'fiber: process {start.name!r} did not start: '}{error}\n")
         return 1
-    except BaseException:
+    except BaseException as error:
         import traceback  # rarely needed, and long to import
 
-        _tell(traceback.format_exc())
+        _tell(traceback.format_exc(), missing_module(error))
         return 1
     return int(process._bootstrap(parent_sentinel=agent))
 
@@ -271,7 +269,7 @@ def _own_path(folder: str) -> tuple[list[str], list[str]]:
     """Return this interpreter's ``sys.path`` in two parts: standard library, installed packages."""
     own = [path for path in sys.path if path and not path.startswith(folder + os.sep)]
     names = map(os.path.basename, own)
-    end = next((index for index, name in enumerate(names) if name in _INSTALLED), len(own))
+    end = next((index for index, name in enumerate(names) if name in INSTALLED), len(own))
     return own[:end], own[end:]
 
 
@@ -349,13 +347,16 @@ def write_whole_lines() -> None:
                 text._CHUNK_SIZE = _LONGEST_LINE
 
 
-def _tell(problem: str) -> None:
-    """Send ``problem`` to the pool of this worker, which raises it; else write it to stderr."""
+def _tell(problem: str, missing: str = "") -> None:
+    """Send ``problem`` to the pool of this worker, which raises it; else write it to stderr.
+
+    ``missing`` is the module that could not be found, if that is the problem.
+    """
     if _task_channel is not None:
         from fiber._wire import work
 
         with contextlib.suppress(OSError):
-            _task_channel.send(pickle.dumps((work.INIT_FAILED, problem)))
+            _task_channel.send(pickle.dumps((work.INIT_FAILED, problem, missing)))
             return
     sys.stderr.write(problem)
 

@@ -31,6 +31,7 @@ from fiber._agent.exception_pickles import encode_error, format_error
 from fiber._hub.remote import Taken, confirm, loads
 from fiber._wire import work
 from fiber._wire.packet import Message
+from fiber._worker_images import missing_module
 
 FUNCTIONS = 128
 """Number of functions that a worker remembers."""
@@ -58,7 +59,8 @@ def run(
             raise
         except BaseException as error:
             with contextlib.suppress(OSError):  # the agent is gone
-                channel.send(pickle.dumps((work.INIT_FAILED, format_error(error))))
+                words = work.INIT_FAILED, format_error(error), missing_module(error)
+                channel.send(pickle.dumps(words))
             raise SystemExit(1) from None
     worker = BatchRunner(channel, child.progress(), retryable)
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:

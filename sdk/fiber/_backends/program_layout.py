@@ -34,8 +34,7 @@ from pathspec.patterns.gitignore import GitIgnorePatternError
 from pathspec.patterns.gitignore.spec import GitIgnoreSpecPattern
 
 from fiber._agent.child import ProgramPaths
-
-_INSTALLED = frozenset({"site-packages", "dist-packages"})
+from fiber._worker_images import INSTALLED
 
 LOOSE = "program"
 """Folder on the other machine for modules that are sent without the folder around them."""
@@ -189,7 +188,7 @@ def _is_sent(path: str) -> bool:
 
 
 def _is_installed(path: str) -> bool:
-    if not _INSTALLED.isdisjoint(path.split(os.sep)):
+    if not set(INSTALLED).isdisjoint(path.split(os.sep)):
         return True
     return any(_is_inside(path, folder) for folder in _own_folders())
 

@@ -13,6 +13,7 @@ from fiber._cli.doctor_facts import Facts, Gatherer, Place, Wishes
 from fiber._cli.doctor_trial_verdicts import NAME, Program, judge
 from fiber._cli.doctor_verdicts import State, Verdict, lines_of, unknown
 from fiber._cli.failures import FAILED
+from fiber._cli.image_packages import IN_EACH_IMAGE, canonical, installed
 from fiber._cli.session import cluster_options, output_option
 from fiber.config import Config
 
@@ -57,7 +58,7 @@ def status_of(verdicts: Iterable[Verdict]) -> int:
     found = list(verdicts)
     trial = [verdict for verdict in found if verdict.check == NAME]
     if trial:
-        return 0 if all(verdict.state is State.OK for verdict in trial) else FAILED
+        return 0 if all(verdict.state in (State.OK, State.NOTE) for verdict in trial) else FAILED
     return FAILED if any(verdict.state is State.FAULT for verdict in found) else 0
 
 
@@ -70,7 +71,12 @@ def _trial(gatherer: Gatherer, facts: Facts, cause: str | None) -> list[Verdict]
     assert isinstance(facts.image, tuple)
     click.echo("making a FiberPool with one worker...", err=True)
     place, settings = facts.place.namespace, facts.configuration
-    program = Program(place, facts.image[0], wants_relay=settings.relay == "always")
+    program = Program(
+        place,
+        facts.image[0],
+        wants_relay=settings.relay == "always",
+        packages=frozenset(canonical(each.name) for each in installed()) - IN_EACH_IMAGE,
+    )
     return judge(attempt(gatherer.api, place, settings, _tell), program)
 
 

@@ -70,7 +70,7 @@ class TrialCourse:
     steps: dict[str, float] = field(default_factory=dict)
     """Seconds from the start of the program, by step."""
     answer: Mapping[str, Any] | None = None
-    """Answer of the task: versions of Python and Fiber, and the number of packages."""
+    """Answer of the task: versions of Python and Fiber, and the names of its packages."""
     error: Mapping[str, str] | None = None
     """Error of the program: ``kind``, ``reason`` and ``message``."""
     refusal: str = ""

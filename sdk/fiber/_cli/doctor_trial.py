@@ -17,7 +17,9 @@ from fiber.pool import Pool
 QUESTION = """{
     "python": __import__("platform").python_version(),
     "fiber": __import__("fiber").__version__,
-    "packages": len(list(__import__("importlib.metadata").metadata.distributions())),
+    "packages": [
+        each.name for each in __import__("importlib.metadata").metadata.distributions() if each.name
+    ],
 }"""
 """Expression for the worker.  It needs no module of this package, which the image may lack."""
 

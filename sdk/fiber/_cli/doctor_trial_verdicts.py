@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import fiber
 from fiber._backends.kubernetes.template import WORKER_IMAGE
+from fiber._cli.display import counted
 from fiber._cli.doctor_attempt import TrialCourse, mismatch_in
-from fiber._cli.doctor_verdicts import Verdict, fault, ok
+from fiber._cli.doctor_verdicts import Verdict, fault, note, ok
+from fiber._cli.image_packages import canonical
 from fiber_api.names import LABEL_RELAY, MASTER_PORT, Reason
 
 NAME = "trial"
+
+_BUILD = "`fiber image build --tag REGISTRY/NAME --push`"
+
+_NAMED = 5
+"""Packages that are named, at most."""
 
 
 class Program(NamedTuple):
@@ -24,6 +31,8 @@ class Program(NamedTuple):
     fiber: str = fiber.__version__
     wants_relay: bool = False
     """True if the configuration has relay='always'."""
+    packages: frozenset[str] = frozenset()
+    """Names of the packages that it has installed."""
 
 
 def judge(trial: TrialCourse, program: Program) -> list[Verdict]:
@@ -46,7 +55,7 @@ def _success(trial: TrialCourse, program: Program) -> Iterator[Verdict]:
     if answer["fiber"] == program.fiber:
         yield ok(
             f"the image has Python {answer['python']}, Fiber {answer['fiber']} and "
-            f"{answer['packages']} packages; this program has Python {program.python}"
+            f"{len(answer['packages'])} packages; this program has Python {program.python}"
         )
     else:
         yield fault(
@@ -54,12 +63,24 @@ def _success(trial: TrialCourse, program: Program) -> Iterator[Verdict]:
             f"{program.image} was built from another version",
             _rebuild(program),
         )
+    if missing := sorted(program.packages - set(map(canonical, answer["packages"]))):
+        yield _lacking(missing)
     if program.wants_relay:
         yield ok("the worker came by a relay, as relay='always' asks")
     elif trial.relay:
         yield ok("pods do not reach this program, and came by a relay")
     else:
         yield ok("pods reach this program")
+
+
+def _lacking(packages: Sequence[str]) -> Verdict:
+    more = len(packages) - _NAMED
+    named = f"{', '.join(packages[:_NAMED])}{f' and {more} more' if more > 0 else ''}"
+    return note(
+        f"the image lacks {counted(len(packages), 'package')} of this program: {named}",
+        "a worker has the packages of its image, and a task that imports another one fails",
+        f"if tasks need them, {_BUILD} makes an image with them",
+    )
 
 
 _STEPS = {
@@ -143,7 +164,7 @@ def _of_image(reason: str, message: str, program: Program) -> Verdict | None:
         return fault(
             f"the image {program.image!r} runs as root",
             message,
-            "give the image a numeric USER, as `fiber image` does",
+            "give the image a numeric USER, as `fiber image build` does",
         )
     if reason in (*_START, Reason.BACKOFF_LIMIT_EXCEEDED):
         if any(words in message.lower() for words in _NO_FIBER):
@@ -228,7 +249,7 @@ def _of_way(reason: str, message: str, program: Program) -> Verdict | None:
 
 def _rebuild(program: Program) -> str:
     return (
-        f"build an image for this program with `fiber image`, or choose one with Python "
+        f"build an image for this program with {_BUILD}, or choose one with Python "
         f"{'.'.join(program.python.split('.')[:2])} and Fiber {program.fiber} with --image"
     )
 

@@ -13,10 +13,12 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from fiber._worker_images import INSTALLED
+
 FIBER = "fiberpool"
 """Name of Fiber's distribution."""
 
-_IN_EACH_IMAGE = frozenset({"pip"})
+IN_EACH_IMAGE = frozenset({"pip"})
 """Packages that are in the image anyway, in its version."""
 
 _PROJECT_FILES = ("pyproject.toml", "setup.py")
@@ -61,7 +63,7 @@ def canonical(name: str) -> str:
 
 def of_environment(without: Collection[str] = ()) -> Contents:
     """Return the packages of this environment, except those in ``without``."""
-    left_out = {canonical(name) for name in without} | _IN_EACH_IMAGE
+    left_out = {canonical(name) for name in without} | IN_EACH_IMAGE
     packages = [each for each in installed() if canonical(each.name) not in {*left_out, FIBER}]
     packages.append(fiber_itself())
     packages.sort(key=lambda each: canonical(each.name))
@@ -132,7 +134,7 @@ def _develop_folder(distribution: metadata.Distribution) -> Path | None:
         return None  # no .egg-info, which `setup.py develop` makes
     folder = Path(str(distribution.locate_file("")))
     places = {Path(sysconfig.get_path(key)) for key in ("purelib", "platlib")}
-    if folder in places or folder.name in ("site-packages", "dist-packages"):
+    if folder in places or folder.name in INSTALLED:
         return None
     projects = (each for each in (folder, folder.parent) if _is_project(each))
     return next(projects, None)

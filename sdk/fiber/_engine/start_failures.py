@@ -43,6 +43,8 @@ class StartFailure(NamedTuple):
     cause: BaseException | None = None
     final: FiberError | None = None
     """Error that no process will start without a remedy: another try is of no use."""
+    advice: str = ""
+    """Note of the error that says what to do, if that is known."""
 
     def error(self, attempts: int) -> FiberError:
         """Return the error that the user gets."""
@@ -50,6 +52,8 @@ class StartFailure(NamedTuple):
             return self.final
         error = StartError(self.who, self.reason, self.text, attempts)
         error.__cause__ = self.cause
+        if self.advice:
+            error.add_note(self.advice)
         return error
 
 

@@ -27,7 +27,7 @@ OTHER = object()
 
 _FORMS: dict[str, Callable[..., bool]] = {
     work.READY: lambda: True,
-    work.INIT_FAILED: lambda text: type(text) is str,
+    work.INIT_FAILED: lambda text, module: type(text) is type(module) is str,
     work.UNKNOWN: lambda seq: type(seq) is int,
     work.BROKEN: lambda seq, error: type(seq) is int and type(error) is bytes,
     work.UNREADABLE: lambda seq, error: type(seq) is int and type(error) is bytes,

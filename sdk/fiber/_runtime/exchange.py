@@ -370,7 +370,7 @@ class AnswerReceiver:
         elif fields[0] == work.READY:
             self._on_ready(handle)
         elif fields[0] == work.INIT_FAILED:
-            handle.note_init_error(fields[1])
+            handle.note_init_error(*fields[1:])
         elif fields[0] == work.UNKNOWN:
             batch = self._held(handle, fields[1])
             if batch is not None and batch.has_function:

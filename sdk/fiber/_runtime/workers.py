@@ -9,7 +9,7 @@ from multiprocessing import process as mp_process
 from multiprocessing.process import BaseProcess
 from typing import Any, NamedTuple, Protocol
 
-from fiber import _logs
+from fiber import _logs, _worker_images
 from fiber._agent import worker
 from fiber._agent.interface import Cause, ChildHandle, ExitReport
 from fiber._agent.last_words import TELL
@@ -101,6 +101,7 @@ class WorkerHandle:
         self._supervisor = supervisor
         self._runtime = runtime
         self._shared = shared  # arguments that all workers of its pool are started with
+        self._missing = ""
         self._terminated = False
         self._pid: int | None = None
         self._born = Latch()
@@ -144,9 +145,10 @@ class WorkerHandle:
         """Count tasks that the worker has done."""
         self.tasks += tasks
 
-    def note_init_error(self, error: str) -> None:
-        """Note the error of the worker's initializer, or of its start."""
+    def note_init_error(self, error: str, missing: str) -> None:
+        """Note the error of the worker's initializer or start, and the module that it lacks."""
         self.init_error = error
+        self._missing = missing
 
     def kill_for(self, reason: str) -> None:
         """Kill the worker, since it sent what no worker sends."""
@@ -209,6 +211,7 @@ class WorkerHandle:
             text,
             killed,
             final=final if isinstance(final, FiberError) else None,
+            advice=_worker_images.advice(self._missing),
         )
 
     # Requests of its Process object

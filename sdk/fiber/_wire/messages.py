@@ -3,9 +3,8 @@
 A frame is a few numbers and then opaque bytes.  No code here unpickles them: only the process that
 gets them does.  The repr of a message, and so the log, does not show the user's data.
 
-Layout (little endian): version:u8, kind:u8, the numbers of that kind, and the rest.  A packet is
-count:u32, payload length:u64, buffer length:u64 * count, the payload, and each buffer at the next
-multiple of ALIGNMENT.
+Layout (little endian): version:u8, kind:u8, the numbers of that kind, and the rest.  See
+``packet_layout.py`` for the layout of a packet.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from collections.abc import Callable, Hashable, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 from fiber._wire.memory_files import BytesLike
-from fiber._wire.packet import ALIGNMENT, INLINE_LIMIT
+from fiber._wire.packet_layout import pieces_of, read_packet
 from fiber.errors import FiberError
 
 PROTOCOL = 4
@@ -45,7 +44,7 @@ class Start(NamedTuple):
     def pieces(self) -> Sequence[BytesLike]:
         """Return the frame in pieces.  The Process is not copied."""
         head = _NUMBER.pack(PROTOCOL, _START, self.child)
-        return _pieces(head, self.spec, [self.process])
+        return pieces_of(head, self.spec, [self.process])
 
     def __repr__(self) -> str:
         return _redacted(self)
@@ -126,7 +125,7 @@ class Deliver(NamedTuple):
     def pieces(self) -> Sequence[BytesLike]:
         """Return the frame in pieces.  The buffers and a large payload are not copied."""
         head = _DELIVERY.pack(PROTOCOL, _DELIVER, self.child, self.seq)
-        return _pieces(head, self.payload, self.buffers)
+        return pieces_of(head, self.payload, self.buffers)
 
     def __repr__(self) -> str:
         return _redacted(self)
@@ -145,7 +144,9 @@ class FromChild(NamedTuple):
 
     def pieces(self) -> Sequence[BytesLike]:
         """Return the frame in pieces.  The buffers and a large payload are not copied."""
-        return _pieces(_NUMBER.pack(PROTOCOL, _FROM_CHILD, self.child), self.payload, self.buffers)
+        return pieces_of(
+            _NUMBER.pack(PROTOCOL, _FROM_CHILD, self.child), self.payload, self.buffers
+        )
 
     def __repr__(self) -> str:
         return _redacted(self)
@@ -252,7 +253,7 @@ class TunnelData(NamedTuple):
     def pieces(self) -> Sequence[BytesLike]:
         """Return the frame in pieces.  The buffers and a large payload are not copied."""
         head = _NUMBER.pack(PROTOCOL, _TUNNEL_DATA, self.tunnel)
-        return _pieces(head, self.payload, self.buffers)
+        return pieces_of(head, self.payload, self.buffers)
 
     def __repr__(self) -> str:
         return _redacted(self)
@@ -369,7 +370,6 @@ _NUMBERS = struct.Struct("<BBQq")
 _DELIVERY = struct.Struct("<BBQQ")
 _GRACE = struct.Struct("<BBd")
 _BLOB_HEAD = struct.Struct(f"<BB{DIGEST_BYTES}s")
-_PACKET = struct.Struct("<IQ")
 
 
 def pieces(message: LinkMessage) -> Sequence[BytesLike]:
@@ -402,47 +402,6 @@ def is_passed_on(frame: BytesLike) -> bool:
     return bytes(frame[1:2]) != bytes([_FROM_CHILD])
 
 
-def _pieces(head: bytes, payload: BytesLike, buffers: Sequence[BytesLike]) -> Sequence[BytesLike]:
-    views = [memoryview(buffer).cast("B") for buffer in buffers]
-    sizes = [view.nbytes for view in views]
-    length = memoryview(payload).nbytes
-    head += _PACKET.pack(len(sizes), length) + struct.pack(f"<{len(sizes)}Q", *sizes)
-    # A small payload may be in borrowed memory, so it is copied.
-    parts: list[BytesLike]
-    parts = [head, payload] if length > INLINE_LIMIT else [b"".join((head, payload))]
-    end = len(head) + length
-    for view in views:
-        start = _aligned(end)
-        parts += [_PADDING[: start - end], view]
-        end = start + view.nbytes
-    return parts
-
-
-def _read_packet(view: memoryview, at: int) -> tuple[memoryview, list[memoryview]]:
-    count, length = _PACKET.unpack_from(view, at)
-    at += _PACKET.size
-    if count > len(view) // 8:
-        raise ValueError(f"it announces {count} buffers")
-    sizes = struct.unpack_from(f"<{count}Q", view, at)
-    at += 8 * count
-    end = at + length
-    payload, buffers = view[at:end], []
-    for size in sizes:
-        start = _aligned(end)
-        end = start + size
-        buffers.append(view[start:end])
-    if end != len(view):
-        raise ValueError(f"it announces a packet that ends after {end} bytes")
-    return payload, buffers
-
-
-def _aligned(offset: int) -> int:
-    return -(-offset // ALIGNMENT) * ALIGNMENT
-
-
-_PADDING = bytes(ALIGNMENT)
-
-
 def _utf8(text: str) -> bytes:
     return text.encode("utf-8", "surrogatepass")  # file names and output may hold lone surrogates
 
@@ -456,7 +415,7 @@ def _json(value: Any) -> bytes:
 
 
 def _read_start(view: memoryview) -> Start:
-    spec, (process,) = _read_packet(view, _NUMBER.size)
+    spec, (process,) = read_packet(view, _NUMBER.size)
     return Start(_NUMBER.unpack_from(view)[2], spec, process)
 
 
@@ -484,11 +443,11 @@ def _read_signal(view: memoryview) -> Signal:
 
 def _read_deliver(view: memoryview) -> Deliver:
     _, _, child, seq = _DELIVERY.unpack_from(view)
-    return Deliver(child, seq, *_read_packet(view, _DELIVERY.size))
+    return Deliver(child, seq, *read_packet(view, _DELIVERY.size))
 
 
 def _read_from_child(view: memoryview) -> FromChild:
-    return FromChild(_NUMBER.unpack_from(view)[2], *_read_packet(view, _NUMBER.size))
+    return FromChild(_NUMBER.unpack_from(view)[2], *read_packet(view, _NUMBER.size))
 
 
 def _read_recall(view: memoryview) -> Recall:
@@ -539,7 +498,7 @@ def _read_tunnel_open(view: memoryview) -> TunnelOpen:
 
 
 def _read_tunnel_data(view: memoryview) -> TunnelData:
-    return TunnelData(_NUMBER.unpack_from(view)[2], *_read_packet(view, _NUMBER.size))
+    return TunnelData(_NUMBER.unpack_from(view)[2], *read_packet(view, _NUMBER.size))
 
 
 def _read_tunnel_close(view: memoryview) -> TunnelClose:

@@ -15,7 +15,8 @@ From a worker, pickled tuples of plain values, so that reading one never runs th
     (UNREADABLE, seq, error)                    its message does not unpickle
     (UNKNOWN, seq)                              the worker does not have its function
     (BROKEN, seq, error)                        its function does not unpickle
-    (READY,)  (INIT_FAILED, text)               the initializer returned; it failed
+    (READY,)                                    the initializer returned
+    (INIT_FAILED, text, module)                 it failed, since it lacks a module if one is named
 
 ``kept`` is the number of tasks of the batch that the worker keeps, one at least, or None for all.
 The worker gives the other tasks back.

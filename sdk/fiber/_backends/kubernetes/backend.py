@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
+from fiber import _worker_images
 from fiber._agent.interface import ChildObserver, ChildSpec
 from fiber._backends.agent_set import AgentSet
 from fiber._backends.kubernetes.api import Api
@@ -58,6 +59,7 @@ class KubernetesBackend:
         self._pods: dict[tuple[PodShape | str, int], Pods] = {}
         """``Pods`` by their shape or pool name, and by the number of earlier ones for the same."""
         self._closing = False
+        _worker_images.use(True)
 
     def child(self, spec: ChildSpec, observer: ChildObserver) -> RemoteChild:
         """Return a child, not started yet, for a pod that has the resources it asks for."""
@@ -92,6 +94,7 @@ class KubernetesBackend:
         """End all pods: delete the program's own pools, and detach from others."""
         self._closing = True
         with contextlib.ExitStack() as rest:  # does all, also if it is interrupted
+            rest.callback(_worker_images.use, False)
             rest.callback(self._output.close)
             rest.callback(self._provisioner.close)
             for pods in list(self._pods.values()):
