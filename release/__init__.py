@@ -25,6 +25,7 @@ def output(*command: str | Path, env: Mapping[str, str] | None = None, cwd: Path
     """Run a command and return its output; ReleaseError with all of its output if it fails."""
     done = subprocess.run(
         command,
+        check=False,
         cwd=cwd,
         env=env,
         stdin=subprocess.DEVNULL,

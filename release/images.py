@@ -83,8 +83,8 @@ def push(image: ReleaseImage, version: str, sources: Path) -> str:
     given = [word for pair in arguments.items() for word in ("--build-arg", "=".join(pair))]
     tags = [word for reference in image.references for word in ("--tag", reference)]
     first = image.references[0]
-    platform = ("--platform", PLATFORM)
-    output("docker", "build", *platform, "--file", image.dockerfile, *given, *tags, ".", cwd=sources)
+    options = ("--platform", PLATFORM, "--file", image.dockerfile)
+    output("docker", "build", *options, *given, *tags, ".", cwd=sources)
     said = output("docker", "run", "--rm", "--entrypoint", "python", first, "-c", image.trial)
     if said.strip() not in ("", version):
         raise ReleaseError(
@@ -93,7 +93,8 @@ def push(image: ReleaseImage, version: str, sources: Path) -> str:
         )
     for reference in image.references:
         output("docker", "push", reference)
-    digests = output("docker", "image", "inspect", "--format", "{{join .RepoDigests \"\\n\"}}", first)
+    format_ = '{{join .RepoDigests "\n"}}'
+    digests = output("docker", "image", "inspect", "--format", format_, first)
     return _digest(digests, image.repository)
 
 

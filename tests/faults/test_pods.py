@@ -152,7 +152,7 @@ def test_a_program_without_an_image_is_told_before_any_pod_is_made(
     with (
         running(backend="kubernetes"),
         fiber.Pool(2) as pool,
-        pytest.raises(ConfigError, match="no image for workers: .*development build.*FIBER_IMAGE"),
+        pytest.raises(ConfigError, match=r"no image for workers: .*development build.*FIBER_IMAGE"),
     ):
         pool.map(square, range(10))
 
