@@ -9,7 +9,7 @@ BIN := $(VENV)/bin
 FAST_TESTS := tests/contract tests/simulation tests/unit
 SIDE_BY_SIDE := -q -n $(shell echo $$(($$(nproc) * 3 / 2))) --dist loadfile
 FAST := $(BIN)/python -m pytest $(SIDE_BY_SIDE) $(FAST_TESTS)
-WHOLE_PROGRAMS := tests/chart tests/examples tests/faults tests/processes tests/release
+WHOLE_PROGRAMS := tests/chart tests/examples tests/faults tests/processes tests/releases
 # Tests that depend most on the interpreter: pickling, starting and ending processes, threads, locks.
 ESSENTIAL_TESTS := $(patsubst %,tests/processes/test_%.py,connection context exit_functions futures \
 	loopback pool process queues synchronize) $(patsubst %,tests/unit/test_%.py,reduction \

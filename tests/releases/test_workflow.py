@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 import yaml
-
 from release.__main__ import _arguments
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -101,8 +100,8 @@ def test_actions_of_others_are_pinned_to_a_commit(workflow: str) -> None:
 
 
 def test_the_logic_is_in_scripts_that_the_tests_run() -> None:
-    commands = [c for script in scripts() for c in re.findall(r"-m release (.*)", script)]
-    known = [_arguments(re.sub(r'["$]', "", command.rstrip(')"')).split()) for command in commands]
+    commands = [c for script in scripts() for c in re.findall(r"-m release ([^)]*)", script)]
+    known = [_arguments(re.sub(r'["$]', "", command).split()) for command in commands]
     assert [found.command for found in known] == ["images", "push-image", "push-chart"]
     makes = [found for script in scripts() for found in re.findall(r"^make (\S+)", script, re.M)]
     assert makes == ["release"]
