@@ -93,7 +93,7 @@ def push(image: ReleaseImage, version: str, sources: Path) -> str:
         )
     for reference in image.references:
         output("docker", "push", reference)
-    format_ = '{{join .RepoDigests "\n"}}'
+    format_ = '{{join .RepoDigests " "}}'
     digests = output("docker", "image", "inspect", "--format", format_, first)
     return _digest(digests, image.repository)
 
