@@ -103,12 +103,7 @@ class _Master:
 
 class _Relay:
     def __init__(self, master: _Master) -> None:
-        agents_port, master_port = _free_port(), _free_port()
-        self.address = f"127.0.0.1:{agents_port}"
-        ports = {
-            "FIBER_RELAY_AGENTS_PORT": str(agents_port),
-            "FIBER_RELAY_MASTER_PORT": str(master_port),
-        }
+        ports = dict.fromkeys(("FIBER_RELAY_AGENTS_PORT", "FIBER_RELAY_MASTER_PORT"), "0")
         self._process = subprocess.Popen(
             [sys.executable, "-m", "fiber.agent"],
             env={**os.environ, **ports},
@@ -116,9 +111,10 @@ class _Relay:
             text=True,
         )
         assert self._process.stdout is not None
-        self._process.stdout.readline()  # it listens
+        agents_port, master_port = re.findall(r"\d+", self._process.stdout.readline())
+        self.address = f"127.0.0.1:{agents_port}"
         self.pid = self._process.pid
-        sock = socket.create_connection(("127.0.0.1", master_port))
+        sock = socket.create_connection(("127.0.0.1", int(master_port)))
         master.loop.call_soon(_connect, master, sock)
         self._process.stdout.readline()  # it is connected
 
@@ -141,11 +137,6 @@ def _connect(master: _Master, sock: socket.socket) -> None:
         on_open=take,
     )
     end.send(hello(epoch=1, identity="bench"))
-
-
-def _free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return int(server.getsockname()[1])
 
 
 def _start_agents(address: str, master: _Master, agents: int) -> subprocess.Popen[Any]:

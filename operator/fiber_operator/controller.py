@@ -542,7 +542,7 @@ class Controller:
             result.requeue_after,
             plan.requeue_at - self._now() if plan.requeue_at is not None else None,
         ]
-        if dependents is not None and dependents.obstacles:
+        if dependents is not None and (dependents.obstacles or dependents.awaits_relay):
             wishes.append(OBSTRUCTED)
         again = min((max(wish, 0.0) for wish in wishes if wish is not None), default=None)
         early = bool(plan.create or plan.delete) or any(

@@ -59,6 +59,8 @@ class Dependents:
     """Value of the PodDisruptionBudget.  None: there is none.  0: not known."""
     relay_name: str | None = ""
     """Name of the relay's Deployment.  Empty: there is none.  None: not known."""
+    awaits_relay: bool = False
+    """True if it is too early to say whether the pod of the relay is refused: check again soon."""
     failure: ApiError | None = None
     """Error of a call with an unknown outcome, to be raised after the status was written."""
 
@@ -68,7 +70,7 @@ class _Found:
     """Outcome of one step."""
 
     value: str | PoolSecret | None = None
-    """Address of the Service, or the Secret."""
+    """Address of the Service, the Secret, or the name of a relay that the cluster acts on."""
     obstacle: Obstacle | None = None
     failure: ApiError | None = None
 
@@ -136,6 +138,7 @@ class DependentsReconciler:
             known is None
             or not fresh
             or bool(known.obstacles)
+            or known.awaits_relay
             or known.relay_name != relay_name  # the Service changes, too
         )
         if known is not None and not complete:
@@ -174,6 +177,8 @@ class DependentsReconciler:
             secret,
             0 if budgeted and found[-1].obstacle is not None else pool.spec.min_available,
             None if relay_found.obstacle is not None else relay_name,
+            bool(relayed and relay_name and relay_found == _Found())
+            and not (known is not None and known.awaits_relay),
             next((step.failure for step in outcomes if step.failure is not None), None),
         )
 
@@ -289,21 +294,27 @@ class DependentsReconciler:
         if patch is not None:
             await self._cluster.patch(SLICES, namespace, name, patch)
 
-    async def _relay(self, pool: FiberPool) -> None:
-        """Make, replace or remove the relay; ``_service`` leads agents to it."""
+    async def _relay(self, pool: FiberPool) -> str | None:
+        """Make, replace or remove the relay; ``_service`` leads agents to it.
+
+        Return its name if the cluster has acted on it.
+        """
         name, namespace = names.relay_name(pool.metadata.name), pool.metadata.namespace
         if not relay.is_wanted(pool):
             await self._remove(pool, DEPLOYMENTS, name)
-            return
+            return None
         wanted = relay.deployment(pool)
         try:
             existing = await self._have(pool, DEPLOYMENTS, name, lambda: wanted)
             if not relay.may_stay(pool, existing, wanted):
                 uid = str(mapping(existing, "metadata").get("uid"))
                 await self._cluster.delete(DEPLOYMENTS, namespace, name, uid=uid)
-                await self._cluster.create(DEPLOYMENTS, namespace, wanted)
+                existing = await self._cluster.create(DEPLOYMENTS, namespace, wanted)
         except Invalid as error:
             raise _Obstructed(messages.refused_relay(error, name)) from None
+        if words := relay.refusal(existing):
+            raise _Obstructed(messages.refused_relay_pod(words, name))
+        return name if relay.is_observed(existing) else None
 
     async def _budget(self, pool: FiberPool) -> None:
         name, namespace = names.budget_name(pool.metadata.name), pool.metadata.namespace

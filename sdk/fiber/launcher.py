@@ -8,7 +8,7 @@ It is configured by its environment:
 
 ``FIBER_LAUNCHER_COMMAND``  the command to run, as a JSON list
 ``FIBER_LAUNCHER_FOLDER``   the folder for the program's files
-``FIBER_LAUNCHER_PORT``     the port to listen at
+``FIBER_LAUNCHER_PORT``     the port to listen at; 0 takes a free one, and the log begins with it
 ``FIBER_LAUNCHER_WAIT``     seconds to wait for the program's files
 
 ``fiber run`` speaks HTTP with it:
@@ -19,6 +19,8 @@ It is configured by its environment:
                             ``Fiber-Follows`` a reader of the output is going to come.  The answer
                             has the header ``Fiber-Failure`` if the program could not be started
 ``GET /output/POSITION``    the records of the output from that position on, until the end
+``POST /monitor``           ask the monitors of the program's processes (``fiber._monitor``); the
+                            body is the request, and the answer has the lines of them all
 ``POST /signal/NUMBER``     send a signal to the program, or end if it does not run yet
 
 A record of the output has a head of a byte and four bytes: what it is, and its length.  0 says that
@@ -54,6 +56,7 @@ from http.server import BaseHTTPRequestHandler
 from typing import IO, Any
 
 from fiber._agent.zygote import unpack
+from fiber._monitor import client
 
 FAILED, NOT_EXECUTABLE, NO_COMMAND = 125, 126, 127
 ALIVE, STDOUT, STDERR, DROPPED, EXIT = range(5)
@@ -66,6 +69,9 @@ STATUS = struct.Struct(">i")
 FOLLOWS, FAILURE = "Fiber-Follows", "Fiber-Failure"
 LAYOUT = "Fiber-Layout"
 
+LISTENS = "fiber run: listens at port "
+"""Begin of the log if the port was left to the system.  The number ends the line."""
+
 HEARTBEAT = 10.0
 """Seconds of silence after which a reader is told that the launcher is alive."""
 
@@ -76,6 +82,9 @@ and the pod's log has what is dropped for the others."""
 _PIECE = 64 << 10
 _BATCH = 256 << 10
 """Bytes after which records are sent."""
+
+_LONGEST_QUESTION = 1 << 16
+"""Bytes of a request to a monitor."""
 
 _PIECE_COST = 256
 """Bytes that a piece of output takes beside its contents, or a little more."""
@@ -118,12 +127,14 @@ class Output:
                 self._changed.notify_all()
 
     def add(self, kind: int, data: bytes) -> None:
-        """Add output.  Waits for readers that would lose output, while they take some."""
+        """Add output.  Waits for readers that would lose output, while they come and take some."""
         with self._changed:
             self._append(kind, data)
             self._changed.notify_all()
             while self._is_full():
                 if self._is_awaited() and self._wait_for_progress():
+                    continue
+                if self._wait_for_first_reader():
                     continue
                 self._begin += len(self._pieces.popleft()[1])
 
@@ -143,6 +154,13 @@ class Output:
         """Return whether a reader has not got the oldest piece."""
         oldest = self._begin + len(self._pieces[0][1])
         return any(position < oldest for position in self._positions.values())
+
+    def _wait_for_first_reader(self) -> bool:
+        """Wait for an expected reader if there is none, and return whether one came."""
+        left = self._expected_until - time.monotonic()
+        if self._positions or left <= 0:
+            return False
+        return self._changed.wait_for(lambda: bool(self._positions), left)
 
     def _wait_for_progress(self) -> bool:
         """Wait until a reader gets on, and return whether one did; leave the slowest behind."""
@@ -169,6 +187,7 @@ class Output:
         reader = object()
         with self._changed:
             self._positions[reader] = position
+            self._changed.notify_all()
         try:
             yield self._records(reader, position, heartbeat)
         except BaseException:
@@ -258,7 +277,7 @@ class ProgramLauncher:
         self._command = command
         self._folder = folder
         self._starting = threading.Lock()
-        self._lock = threading.RLock()  # the main thread's signal handlers take it, too
+        self._lock = threading.Lock()
         self._process: subprocess.Popen[bytes] | None = None
         self._copies: list[threading.Thread] = []
         self._ended, self._ended_in = os.pipe2(os.O_CLOEXEC)
@@ -437,6 +456,30 @@ class _Handler(BaseHTTPRequestHandler):
                 self._answer_start(self._launcher.failure)
 
     def do_POST(self) -> None:
+        if self.path == "/monitor":
+            self._ask_monitors()
+        else:
+            self._send_signal()
+
+    def _ask_monitors(self) -> None:
+        try:
+            request = json.loads(self.rfile.read(self._question_size()))
+        except ValueError:
+            self.send_error(400)
+            return
+        self._answer()
+        for path in client.sockets():
+            with contextlib.suppress(client.NoAnswer):
+                for line in client.ask(path, request):
+                    self.wfile.write(json.dumps(line).encode() + b"\n")
+
+    def _question_size(self) -> int:
+        size = int(self.headers.get("Content-Length", "none"))
+        if not 0 <= size <= _LONGEST_QUESTION:
+            raise ValueError(size)
+        return size
+
+    def _send_signal(self) -> None:
         number = self._number()
         if number not in signal.valid_signals():
             self.send_error(400)
@@ -496,6 +539,25 @@ class _Handler(BaseHTTPRequestHandler):
         """Write nothing: the log is the program's."""
 
 
+def _pass_on_signals(launcher: ProgramLauncher) -> None:
+    """Pass on signals to the program, on a thread.
+
+    Python calls handlers on the main thread only, between two steps.  A signal that comes just
+    before the main thread waits would have no effect until the wait is over.
+    """
+    received, wake = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
+    os.set_blocking(received, True)
+    signal.set_wakeup_fd(wake)
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, lambda *_: None)  # the kernel must not end the launcher
+
+    def pass_on() -> None:
+        while True:
+            launcher.end_by(os.read(received, 1)[0])
+
+    threading.Thread(target=pass_on, name="fiber-signals", daemon=True).start()
+
+
 def _wait_for_files(launcher: ProgramLauncher, seconds: float) -> bool:
     """Wait until the program was started; return False if nothing arrives for so long."""
     received = 0
@@ -517,13 +579,14 @@ def main() -> int:
         print(f"fiber.launcher is for the pods of `fiber run`: {error}", file=sys.stderr)
         return FAILED
     launcher = ProgramLauncher(command, folder, Output())
-    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-        signal.signal(number, lambda received, _: launcher.end_by(received))
+    _pass_on_signals(launcher)
     try:
         server = _LauncherServer(port, launcher)
     except OSError as error:
         print(f"fiber run: cannot listen at port {port}: {_words(error)}", file=sys.stderr)
         return FAILED
+    if not port:
+        print(f"{LISTENS}{server.server_address[1]}", file=sys.stderr, flush=True)
     threading.Thread(target=server.serve_forever, name="fiber-serve", daemon=True).start()
     if not _wait_for_files(launcher, seconds):
         print("fiber run: the program's files did not arrive in time", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""Closed networks: only traffic that the chart and docs/kubernetes.md ask for passes."""
+"""Closed networks: only traffic that the chart and docs/administrators.md ask for passes."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def operator_egress(release: Release, ports: Sequence[int]) -> Iterator[Allowed]
 
 
 def program_traffic(host: str, ports: Sequence[int]) -> Iterator[Allowed]:
-    """Yield the traffic of docs/kubernetes.md: the API server, and workers at the listen_port."""
+    """Yield what docs/administrators.md asks for: the API server, workers at the listen_port."""
     yield Allowed(host, "tcp", PORT)
     for port in ports:
         yield Allowed(protocol="tcp", port=port)

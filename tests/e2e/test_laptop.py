@@ -11,6 +11,7 @@ import pytest
 from cluster.laptop import Laptop
 from e2e.accounts import may_not
 from e2e.clusters import Cluster
+from e2e.faults import OUTAGE, Trouble, api_server_stopped
 from e2e.kube import Body
 from e2e.leftovers import leaves_nothing
 from e2e.pools import is_ready
@@ -22,8 +23,6 @@ from fiber_api import names
 
 pytestmark = pytest.mark.timeout(300, func_only=True)
 
-OUTAGE = 60
-"""Seconds."""
 STRANGERS = 1000
 
 
@@ -67,32 +66,28 @@ def test_an_example_prints_the_same_as_on_one_machine(
     leaves_nothing(program)
 
 
-class Trouble:
-    """Place where a fault strikes."""
+class LaptopTrouble(Trouble):
+    """Trouble that may strike the laptop of the program, too."""
+
+    program: Outside
 
     def __init__(self, cluster: Cluster, laptop: Laptop, scene: Scene, program: Outside) -> None:
-        self.cluster = cluster
+        super().__init__(cluster, scene, program)
         self.laptop = laptop
-        self.scene = scene
-        self.program = program
-
-    def lasts(self, seconds: float) -> None:
-        """Wait, and check that the program does not end meanwhile."""
-        self.scene.never("it ends", lambda: self.program.status is not None, seconds)
 
 
-Fault = Callable[[Trouble], AbstractContextManager[None]]
+Fault = Callable[[LaptopTrouble], AbstractContextManager[None]]
 
 
 @contextmanager
-def relay_killed(trouble: Trouble) -> Iterator[None]:
+def relay_killed(trouble: LaptopTrouble) -> Iterator[None]:
     (pod,) = relays(trouble.scene)
     trouble.cluster.kill(pod, names.RELAY_CONTAINER)
     yield
 
 
 @contextmanager
-def relay_deleted(trouble: Trouble) -> Iterator[None]:
+def relay_deleted(trouble: LaptopTrouble) -> Iterator[None]:
     (pod,) = relays(trouble.scene)
     name = pod["metadata"]["name"]
     trouble.scene.kube.delete(trouble.scene.path("pods", name), {"gracePeriodSeconds": 0})
@@ -100,13 +95,13 @@ def relay_deleted(trouble: Trouble) -> Iterator[None]:
 
 
 @contextmanager
-def address_changed(trouble: Trouble) -> Iterator[None]:
+def address_changed(trouble: LaptopTrouble) -> Iterator[None]:
     trouble.laptop.move()
     yield
 
 
 @contextmanager
-def cable_cut_and_address_changed(trouble: Trouble) -> Iterator[None]:
+def cable_cut_and_address_changed(trouble: LaptopTrouble) -> Iterator[None]:
     with trouble.laptop.unplugged():
         trouble.lasts(OUTAGE)
     trouble.laptop.move()
@@ -114,14 +109,7 @@ def cable_cut_and_address_changed(trouble: Trouble) -> Iterator[None]:
 
 
 @contextmanager
-def api_server_stopped(trouble: Trouble) -> Iterator[None]:
-    with trouble.cluster.without_apiserver():
-        trouble.lasts(OUTAGE)
-    yield
-
-
-@contextmanager
-def program_stopped(trouble: Trouble) -> Iterator[None]:
+def program_stopped(trouble: LaptopTrouble) -> Iterator[None]:
     trouble.program.pause()
     trouble.lasts(OUTAGE)
     trouble.program.resume()
@@ -150,7 +138,7 @@ def test_a_map_survives_a_fault_unchanged(
 ) -> None:
     program = programs.on_laptop("mapping.py", "--task", "loud", "--seconds", seconds)
     program.says("first")
-    with fault(Trouble(cluster, laptop, scene, program)):
+    with fault(LaptopTrouble(cluster, laptop, scene, program)):
         assert program.says("done", seconds=180)["total"] == SQUARES
     program.ends(seconds=90)
     # Links resumed: no task was lost with its worker, so none ran twice.

@@ -9,6 +9,7 @@ from contextlib import AbstractContextManager, contextmanager
 import pytest
 
 from e2e.clusters import Cluster
+from e2e.faults import OUTAGE, Trouble, api_server_stopped
 from e2e.kube import Body
 from e2e.leftovers import leaves_nothing
 from e2e.pools import is_ready
@@ -28,18 +29,14 @@ SILENCE = 15
 """Seconds without messages after which a worker is lost."""
 BRIEF = 8
 """Seconds of silence that cause no loss."""
-OUTAGE = 60
-"""Seconds."""
 
 
-class Site:
-    """Place where a fault strikes: the cluster, its installation, and a running program."""
+class OperatorTrouble(Trouble):
+    """Trouble that may strike the operator, too."""
 
     def __init__(self, cluster: Cluster, release: Release, scene: Scene, program: Program) -> None:
-        self.cluster = cluster
+        super().__init__(cluster, scene, program)
         self.release = release
-        self.scene = scene
-        self.program = program
 
     def a_worker(self) -> Body:
         """A pod that works."""
@@ -64,61 +61,53 @@ class Site:
         self.scene.wait(f"{name} is gone", lambda: name not in self.scene.now["pods"])
 
 
-Fault = Callable[[Site], AbstractContextManager[None]]
+Fault = Callable[[OperatorTrouble], AbstractContextManager[None]]
 
 
 @contextmanager
-def pod_deleted(site: Site) -> Iterator[None]:
-    victim = site.a_worker()
-    site.scene.kube.delete(site.scene.path("pods", victim["metadata"]["name"]))
-    site.gone(victim)
+def pod_deleted(trouble: OperatorTrouble) -> Iterator[None]:
+    victim = trouble.a_worker()
+    trouble.scene.kube.delete(trouble.scene.path("pods", victim["metadata"]["name"]))
+    trouble.gone(victim)
     yield
 
 
 @contextmanager
-def container_killed(site: Site) -> Iterator[None]:
-    site.cluster.kill(site.a_worker(), names.WORKER_CONTAINER)
+def container_killed(trouble: OperatorTrouble) -> Iterator[None]:
+    trouble.cluster.kill(trouble.a_worker(), names.WORKER_CONTAINER)
     yield
 
 
 @contextmanager
-def operator_killed(site: Site) -> Iterator[None]:
-    site.cluster.kill(site.release.pod(), "operator")
+def operator_killed(trouble: OperatorTrouble) -> Iterator[None]:
+    trouble.cluster.kill(trouble.release.pod(), "operator")
     yield
-    site.release.wait_until_ready()
+    trouble.release.wait_until_ready()
 
 
 @contextmanager
-def api_server_stopped(site: Site) -> Iterator[None]:
-    """Stop the API server for a minute, in which the work goes on."""
-    with site.cluster.without_apiserver():
-        site.scene.never("it ends", lambda: site.program.status is not None, OUTAGE)
-    yield
-
-
-@contextmanager
-def node_cut_off(site: Site) -> Iterator[None]:
+def node_cut_off(trouble: OperatorTrouble) -> Iterator[None]:
     """Until the work is done elsewhere."""
-    with site.cluster.cut_off(site.a_node()):
-        site.program.says("done", seconds=90)
+    with trouble.cluster.cut_off(trouble.a_node()):
+        trouble.program.says("done", seconds=90)
         yield
 
 
 @contextmanager
-def node_back_in_time(site: Site) -> Iterator[None]:
+def node_back_in_time(trouble: OperatorTrouble) -> Iterator[None]:
     """Before its workers count as lost."""
-    with site.cluster.cut_off(site.a_node()):
-        site.scene.never("it ends", lambda: site.program.status is not None, BRIEF)
-    site.program.says("done", seconds=90)
-    assert len(list(filter(is_worker, ever(site.scene, "pods").values()))) <= 3
+    with trouble.cluster.cut_off(trouble.a_node()):
+        trouble.lasts(BRIEF)
+    trouble.program.says("done", seconds=90)
+    assert len(list(filter(is_worker, ever(trouble.scene, "pods").values()))) <= 3
     yield
 
 
 @contextmanager
-def node_back_too_late(site: Site) -> Iterator[None]:
+def node_back_too_late(trouble: OperatorTrouble) -> Iterator[None]:
     """Reconnect a node after its workers were lost: their late results do not count."""
-    with site.cluster.cut_off(site.a_node()):
-        site.scene.never("it ends", lambda: site.program.status is not None, SILENCE + 10)
+    with trouble.cluster.cut_off(trouble.a_node()):
+        trouble.lasts(SILENCE + 10)
     yield
 
 
@@ -148,7 +137,7 @@ def test_a_map_survives_a_fault_unchanged(
     programs.node = release.pod()["spec"]["nodeName"]  # the other ones are there for faults
     program = programs.start(place, "mapping.py", "--seconds", seconds)
     program.says("first")
-    with fault(Site(cluster, release, scene, program)):
+    with fault(OperatorTrouble(cluster, release, scene, program)):
         assert program.says("done", seconds=120)["total"] == SQUARES
     program.ends(seconds=90)
     leaves_nothing(program, seconds=90)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -46,6 +47,17 @@ for number in range(10_000):
     print(number, flush=True)
     time.sleep(0.01)
 """
+HANG = """
+import collections, itertools
+import fiber as mp
+
+def hang(_):
+    collections.deque(itertools.repeat(None), maxlen=0)
+
+if __name__ == "__main__":
+    with mp.Pool(1) as pool:
+        pool.map(hang, [0])
+"""
 
 
 class Person:
@@ -63,6 +75,7 @@ class Person:
         (folder / "count.py").write_text(COUNT, encoding="utf-8")
         (folder / "helper.py").write_text(HELPER, encoding="utf-8")
         (folder / "wait.py").write_text(WAIT, encoding="utf-8")
+        (folder / "hang.py").write_text(HANG, encoding="utf-8")
 
     def start(self, *words: str) -> subprocess.Popen[str]:
         return subprocess.Popen(
@@ -84,7 +97,8 @@ class Person:
         found: list[dict[str, str]] = []
 
         def so() -> bool:
-            found[:] = json.loads(self.runs("ps", "--output", "json").stdout)
+            words = ("ps", "--namespace", self.scene.namespace, "--output", "json")
+            found[:] = json.loads(self.runs(*words).stdout)
             return [row["state"] for row in found] == list(states)
 
         self.scene.wait(f"programs are {states}", so, PATIENCE, poll=0.5)
@@ -144,6 +158,23 @@ def test_a_killed_command_leaves_the_program_running(person: Person) -> None:
         person.runs("stop", "waits", "--now")
         again.communicate(timeout=PATIENCE)
     assert again.returncode != 0
+
+
+def test_the_stack_of_a_worker_that_hangs_in_native_code_is_shown(person: Person) -> None:
+    with person.start("run", "--service-account", ACCOUNT, "--name", "hangs", "hang.py") as run:
+
+        def stack() -> str | None:
+            found = person.runs("stack", "hangs")
+            return found.stdout if " in hang\n" in found.stdout else None
+
+        text = person.scene.wait("the worker hangs", stack, PATIENCE, poll=0.5) or ""
+        assert text.startswith("program (pid ")
+        assert " in map\n" in text
+        (worker,) = (line for line in text.splitlines() if "PoolWorker" in line)
+        (pod,) = re.findall("host ([^,]+), busy", worker)
+        assert " in hang\n" in person.runs("stack", "hangs", "--worker", pod).stdout
+        person.runs("stop", "hangs", "--now")
+        run.communicate(timeout=PATIENCE)
 
 
 def test_output_goes_on_where_it_was_after_the_api_server_was_away(

@@ -20,6 +20,9 @@ PAGES = sorted(
 FENCED = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 BENCHMARKS = (ROOT / "docs" / "benchmarks" / "README.md").read_text(encoding="utf-8")
 LINK = re.compile(r"\]\(([^)\s#]+)[^)]*\)")
+PLACE = re.compile(r"\]\(([^)\s#:]*)#([^)\s]+)\)")
+HEADING = re.compile(r"^#+ (.+)$", re.MULTILINE)
+BLOCK = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
 
 
 def name_of(page: Path) -> str:
@@ -79,6 +82,24 @@ def test_links_lead_to_files(page: Path) -> None:
     links = LINK.findall(page.read_text(encoding="utf-8"))
     inside = [link for link in links if "://" not in link]
     assert [link for link in inside if not os.path.exists(page.parent / link)] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_links_lead_to_headings(page: Path) -> None:
+    links = PLACE.findall(BLOCK.sub("", page.read_text(encoding="utf-8")))
+    pages = [(link, page.parent / link if link else page, place) for link, place in links]
+    missing = [
+        f"{link}#{place}"
+        for link, target, place in pages
+        if target.suffix == ".md" and place not in anchors(target)
+    ]
+    assert missing == []
+
+
+def anchors(page: Path) -> set[str]:
+    """Return the anchors of the headings: lower-case, without punctuation, hyphens for spaces."""
+    headings = HEADING.findall(BLOCK.sub("", page.read_text(encoding="utf-8")))
+    return {re.sub(r"[^\w\- ]", "", found.lower()).replace(" ", "-") for found in headings}
 
 
 def test_makes_targets_are_the_ones_that_are_shown() -> None:

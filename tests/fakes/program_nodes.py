@@ -10,7 +10,6 @@ import contextlib
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -23,6 +22,7 @@ from aiohttp import WSMsgType, web
 from fakes.kubernetes_api import Call
 from fakes.served import Served
 from fakes.store import Body, Failure
+from fiber.launcher import LISTENS
 from fiber_api import names
 from patience import PATIENCE
 
@@ -41,8 +41,7 @@ class Launched:
 
     def __init__(self, body: Body, folder: Path) -> None:
         folder.mkdir()
-        self.port = _free_port()
-        self.log = folder / "log"
+        self._log = folder / "log"
         container = next(c for c in body["spec"]["containers"] if c["name"] == "program")
         given = {each["name"]: each["value"].replace("$$", "$") for each in container["env"]}
         place = given["FIBER_LAUNCHER_FOLDER"]
@@ -52,10 +51,10 @@ class Launched:
             command[0] = sys.executable
         given |= {
             "FIBER_LAUNCHER_FOLDER": str(folder / "program"),
-            "FIBER_LAUNCHER_PORT": str(self.port),
+            "FIBER_LAUNCHER_PORT": "0",
             "FIBER_LAUNCHER_COMMAND": json.dumps(command),
         }
-        with self.log.open("wb") as log:
+        with self._log.open("wb") as log:
             self.process = subprocess.Popen(
                 [sys.executable, "-c", _AS_PROCESS_1],
                 env={**os.environ, **given},
@@ -64,6 +63,24 @@ class Launched:
                 stderr=log,
                 start_new_session=True,
             )
+
+    @property
+    def port(self) -> int | None:
+        """Port at which the launcher listens; None before it listens."""
+        first = self._lines()[0]
+        listens = first.startswith(LISTENS) and first.endswith("\n")
+        return int(first.removeprefix(LISTENS)) if listens else None
+
+    @property
+    def log(self) -> bytes:
+        """What the pod has written, without the line about the port."""
+        first, rest = self._lines()
+        return rest if first.startswith(LISTENS) else first.encode() + rest
+
+    def _lines(self) -> tuple[str, bytes]:
+        """Return the first line, and what follows it."""
+        first, newline, rest = self._log.read_bytes().partition(b"\n")
+        return (first + newline).decode(errors="replace"), rest
 
 
 class ProgramNodes:
@@ -118,7 +135,7 @@ class ProgramNodes:
             time.sleep(0.01)
 
     def log_of(self, pod: str) -> bytes:
-        return self.launched[pod].log.read_bytes()
+        return self.launched[pod].log
 
     def close(self) -> None:
         for launched in self.launched.values():
@@ -253,8 +270,9 @@ async def _connect(
 ) -> tuple[asyncio.StreamReader, asyncio.StreamWriter] | None:
     """Connect to the launcher as soon as it listens; None if it has ended."""
     while launched is not None and launched.process.poll() is None:
-        with contextlib.suppress(ConnectionError):
-            return await asyncio.open_connection("127.0.0.1", launched.port)
+        if (port := launched.port) is not None:
+            with contextlib.suppress(ConnectionError):
+                return await asyncio.open_connection("127.0.0.1", port)
         await asyncio.sleep(0.01)
     return None
 
@@ -264,13 +282,6 @@ def _namespace(pods: list[Body], name: str) -> str:
     if not found:
         raise Failure(404, "NotFound", f"pod {name} is gone")
     return found[0]
-
-
-def _free_port() -> int:
-    with socket.socket() as sock:
-        sock.bind(("127.0.0.1", 0))
-        port: int = sock.getsockname()[1]
-        return port
 
 
 def kill(launched: Launched) -> None:

@@ -28,6 +28,7 @@ from fiber._runtime import state
 from fiber.errors import ConfigError, FiberPoolError, MemberLost, WorkerDied
 from fiber_api import names
 from patience import PATIENCE
+from ports import reserved_port
 from unit.kubernetes_rig import kubeconfig
 
 KEPT = ("fiberpools", "pods", "secrets", "leases", "services", "endpointslices")
@@ -66,9 +67,11 @@ def pods_of(cluster: FakeCluster) -> list[str]:
     return [pod["metadata"]["name"] for pod in cluster.objects("pods")]
 
 
-def free_port() -> int:
-    with socket.create_server(("", 0)) as taken:
-        return int(taken.getsockname()[1])
+@pytest.fixture
+def port() -> Iterator[int]:
+    """A port at which a program can listen again, for its next FiberPool."""
+    with reserved_port() as found:
+        yield found
 
 
 def square(number: int) -> int:
@@ -323,9 +326,8 @@ def test_a_child_that_is_killed_before_it_has_a_pod_is_gone_and_its_pod_not_want
         cluster.wait(lambda: not cluster.world.pods("lab"))
 
 
-def test_a_killed_pod_costs_its_tasks_another_run(cluster: FakeCluster) -> None:
-    # The next one listens at the same port.
-    with running(backend="kubernetes", listen_port=free_port()), fiber.Pool(2) as pool:
+def test_a_killed_pod_costs_its_tasks_another_run(cluster: FakeCluster, port: int) -> None:
+    with running(backend="kubernetes", listen_port=port), fiber.Pool(2) as pool:
         result = pool.map_async(slow_square, range(200), chunksize=1)
         pool.wait_until_workers_up(PATIENCE)
         victim = pool.workers()[0].host
@@ -346,9 +348,8 @@ def test_a_task_that_dies_with_its_pod_says_so(cluster: FakeCluster) -> None:
         assert "@fiber.meta(memory=)" in str(caught.value)
 
 
-def test_a_deleted_pod_costs_its_tasks_another_run(cluster: FakeCluster) -> None:
-    # The next one listens at the same port.
-    with running(backend="kubernetes", listen_port=free_port()), fiber.Pool(2) as pool:
+def test_a_deleted_pod_costs_its_tasks_another_run(cluster: FakeCluster, port: int) -> None:
+    with running(backend="kubernetes", listen_port=port), fiber.Pool(2) as pool:
         result = pool.map_async(slow_square, range(200), chunksize=1)
         pool.wait_until_workers_up(PATIENCE)
         victim = pool.workers()[0].host
@@ -400,10 +401,9 @@ def test_the_deletion_of_a_fiber_pool_is_reported_and_the_next_pool_gets_another
 
 
 def test_a_map_whose_fiber_pool_is_deleted_goes_on_with_another(
-    cluster: FakeCluster,
+    cluster: FakeCluster, port: int
 ) -> None:
-    # The next one listens at the same port.
-    with running(backend="kubernetes", listen_port=free_port()), fiber.Pool(1) as pool:
+    with running(backend="kubernetes", listen_port=port), fiber.Pool(1) as pool:
         result = pool.map_async(slow_square, range(100), chunksize=1)
         pool.wait_until_workers_up(PATIENCE)
         (first,) = (one["metadata"]["name"] for one in cluster.objects("fiberpools"))
@@ -571,8 +571,7 @@ def test_a_program_takes_one_free_port_of_a_range_for_all_its_pools(cluster: Fak
     assert found[0] in range(first + 1, first + 21)
 
 
-def test_pods_dial_the_advertised_address(cluster: FakeCluster) -> None:
-    port = free_port()
+def test_pods_dial_the_advertised_address(cluster: FakeCluster, port: int) -> None:
     here = _local_address("192.0.2.1")
     assert here is not None
     with (

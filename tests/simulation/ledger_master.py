@@ -66,6 +66,9 @@ class Member:
         """Take back the packets that it did not read."""
         self._master.recalled(self, seqs)
 
+    def showed_stack(self, text: str) -> None:
+        """Take its stacks."""
+
     def draining(self) -> None:
         """Note that its host is about to go."""
 

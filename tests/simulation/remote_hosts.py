@@ -154,6 +154,10 @@ class Seen:
         """Take back the packets that it did not read."""
         self._observer.recalled(seqs)
 
+    def showed_stack(self, text: str) -> None:
+        """Take its stacks."""
+        self._observer.showed_stack(text)
+
     def draining(self) -> None:
         """Note that its host is about to go."""
         self._observer.draining()

@@ -40,6 +40,10 @@ class Recorder:
         self.unread = seqs
         self._note("taken back")
 
+    def showed_stack(self, text: str) -> None:
+        self.words.append(text)
+        self._note("showed stack")
+
     def draining(self) -> None:
         self._note("draining")
 

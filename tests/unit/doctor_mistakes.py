@@ -253,13 +253,6 @@ MISTAKES = [
         "log of its pod",
     ),
     Mistake(
-        "no account of programs",
-        lambda rig: rig.cluster.forbid("create", "rolebindings"),
-        "account of fiber run",
-        "no account 'fiber-program'",
-        "kubectl create serviceaccount",
-    ),
-    Mistake(
         "bad template",
         lambda rig: rig.setenv("TEMPLATE", rig.folder / "none.yaml"),
         "image",

@@ -186,12 +186,6 @@ def black_hole() -> Iterator[str]:
         yield f"127.0.0.1:{full.getsockname()[1]}"
 
 
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 def port_of(address: str) -> int:
     return int(address.rpartition(":")[2])
 

@@ -20,6 +20,7 @@ from fiber._backends.kubernetes.template import fiber_pool_body
 from fiber._cli import doctor
 from fiber._cli.doctor_attempt import LONGEST_START, settings_of
 from fiber._cli.doctor_rights import (
+    ACCOUNT_RIGHTS,
     PROGRAM_RIGHTS,
     RUN_RIGHTS,
     RUNNER_RIGHTS,
@@ -176,11 +177,28 @@ def test_a_missing_right_is_named(rig: DoctorRig, right: Right) -> None:
 @pytest.mark.parametrize("right", RUN_RIGHTS, ids=str)
 def test_a_missing_right_of_run_is_named(rig: DoctorRig, right: Right) -> None:
     rig.cluster.forbid(right.verb, right.resource)
-    found = [verdict for verdict in verdicts() if verdict["state"] == "fault"]
-    assert {"rights", "special rights", "rights of fiber run"} >= {each["check"] for each in found}
-    assert found[-1]["check"] == "rights of fiber run"
-    assert found[-1]["what"] == f"this account may not {right}"
-    assert "fiber-runner" in found[-1]["do"]
+    (found,) = [verdict for verdict in verdicts() if verdict["state"] == "note"]
+    assert found["check"] == "rights of fiber run"
+    assert found["what"] == f"this account may not {right}"
+    assert found["why"].startswith("only `fiber run` needs this")
+    assert "fiber-runner" in found["do"]
+
+
+def test_programs_do_without_the_rights_and_the_account_of_fiber_run(rig: DoctorRig) -> None:
+    for right in (*RUNNER_RIGHTS, *ACCOUNT_RIGHTS):
+        rig.cluster.forbid(right.verb, right.resource)
+    outcome = run("doctor", "--no-trial")
+    assert outcome.status == run("doctor").status == 0
+    assert {line[0] for line in outcome.out.splitlines() if line[0] != " "} == {"✓", "!", "-"}
+    assert outcome.out.count("kubectl create rolebinding") == 1
+
+
+def test_an_account_of_programs_that_cannot_be_made_is_a_note(rig: DoctorRig) -> None:
+    rig.cluster.forbid("create", "rolebindings")
+    (found,) = [verdict for verdict in verdicts() if verdict["state"] == "note"]
+    assert found["check"] == "account of fiber run"
+    assert "no account 'fiber-program'" in found["what"]
+    assert "kubectl create serviceaccount" in found["do"]
 
 
 def by_resource(rights: tuple[Right, ...]) -> dict[str, set[str]]:

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import termios
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -310,12 +311,15 @@ def test_ctrl_c_while_attaching_leaves_the_program(site: Site) -> None:
 # ---- terminals and pipes
 
 
-def test_a_killed_terminal_leaves_the_program(site: Site) -> None:
-    site.waits()
-    ours, theirs = pty.openpty()
-    try:
-        command = site.spawn(
-            *("run", "--name", "mine", "train.py"),
+class Terminal:
+    """Terminal in which a command runs a program that waits."""
+
+    def __init__(self, site: Site, *words: str) -> None:
+        site.waits()
+        self.shown = b""
+        self._ours, theirs = pty.openpty()
+        self.command = site.spawn(
+            *words,
             stdin=theirs,
             stdout=theirs,
             stderr=theirs,
@@ -323,39 +327,16 @@ def test_a_killed_terminal_leaves_the_program(site: Site) -> None:
             preexec_fn=take_terminal,
         )
         os.close(theirs)
-        shown = b""
-        while b"begun" not in shown:
-            shown += os.read(ours, 1000)
-    finally:
-        os.close(ours)
-    assert command.wait(PATIENCE) == -signal.SIGHUP
-    again = site.begin("run", "--attach", "mine")
-    interrupt(again)
-    assert site.end(again)[:2] == (9, "interrupted\n")
 
+    def press(self, key: bytes) -> None:
+        os.write(self._ours, key)
 
-def test_ctrl_c_in_a_terminal(site: Site) -> None:
-    site.waits()
-    ours, theirs = pty.openpty()
-    try:
-        command = site.spawn(
-            *("run", "train.py"),
-            stdin=theirs,
-            stdout=theirs,
-            stderr=theirs,
-            start_new_session=True,
-            preexec_fn=take_terminal,
-        )
-        os.close(theirs)
-        shown = b""
-        while b"begun" not in shown:
-            shown += os.read(ours, 1000)
-        os.write(ours, b"\x03")
-        while b"interrupted" not in shown.replace(b"interrupting", b""):
-            shown += os.read(ours, 1000)
-        assert command.wait(PATIENCE) == 9
-    finally:
-        os.close(ours)
+    def read_until(self, word: bytes) -> None:
+        while word not in self.shown:
+            self.shown += os.read(self._ours, 1000)
+
+    def close(self) -> None:
+        os.close(self._ours)
 
 
 def take_terminal() -> None:
@@ -363,6 +344,23 @@ def take_terminal() -> None:
     import fcntl
 
     fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+
+
+def test_a_killed_terminal_leaves_the_program(site: Site) -> None:
+    with closing(Terminal(site, "run", "--name", "mine", "train.py")) as terminal:
+        terminal.read_until(b"begun")
+    assert terminal.command.wait(PATIENCE) == -signal.SIGHUP
+    again = site.begin("run", "--attach", "mine")
+    interrupt(again)
+    assert site.end(again)[:2] == (9, "interrupted\n")
+
+
+def test_ctrl_c_in_a_terminal(site: Site) -> None:
+    with closing(Terminal(site, "run", "train.py")) as terminal:
+        terminal.read_until(b"begun")
+        terminal.press(b"\x03")
+        terminal.read_until(b"interrupted")
+        assert terminal.command.wait(PATIENCE) == 9
 
 
 def test_a_closed_pipe_ends_the_program(site: Site) -> None:

@@ -307,6 +307,14 @@ def test_warm_goes_on_if_the_pool_changes_or_comes_meanwhile(cluster: Cluster) -
     assert "is changed" in run("pool", "warm", "new", "--workers", "5").out
 
 
+@pytest.mark.parametrize(("number", "words"), [(0, "0 workers"), (1, "1 worker"), (2, "2 workers")])
+def test_a_number_of_workers_has_its_noun(number: int, words: str, cluster: Cluster) -> None:
+    made, changed = (run("pool", "warm", "new", "--workers", str(number)).out for _ in range(2))
+    assert f"is made, with {words}\n" in made
+    assert f"it keeps {words}\n" in changed
+    assert f"is asked for {words}\n" in run("pool", "scale", "new", str(number)).out
+
+
 @pytest.mark.parametrize(
     "words",
     [

@@ -70,10 +70,7 @@ class Site:
     def __init__(self, nodes: ProgramNodes, session: Session, sock: socket.socket) -> None:
         self._sock = sock
         self.client = LauncherClient(session, "p")
-        launched = object.__new__(Launched)
-        launched.port = sock.getsockname()[1]
-        launched.process = RunningProcess()  # type: ignore[assignment]  # all that is asked of it
-        nodes.launched["p"] = launched
+        nodes.launched["p"] = ListeningSocket(sock)
 
     @contextlib.contextmanager
     def answering(self, answer: bytes) -> Iterator[None]:
@@ -91,6 +88,18 @@ class Site:
         thread.start()
         yield
         thread.join(PATIENCE)
+
+
+class ListeningSocket(Launched):
+    """Socket in the place of a launcher."""
+
+    def __init__(self, sock: socket.socket) -> None:
+        self._sock = sock
+        self.process = RunningProcess()  # type: ignore[assignment]  # all that is asked of it
+
+    @property
+    def port(self) -> int:
+        return int(self._sock.getsockname()[1])
 
 
 class RunningProcess:

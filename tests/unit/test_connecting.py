@@ -11,7 +11,8 @@ import pytest
 
 from fiber._transport import dialer
 from fiber._transport.dialer import connect
-from unit.link_site import Site, black_hole, free_port, port_of
+from ports import reserved_port
+from unit.link_site import Site, black_hole, port_of
 
 PATIENCE = 3600.0
 """Seconds, longer than any test may take: an attempt that must not be waited for."""
@@ -31,9 +32,8 @@ pytestmark = pytest.mark.skipif(not has_ipv6(), reason="this machine has no ::1"
 @pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
 def test_the_address_that_answers_is_taken(host: str) -> None:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with socket.create_server((host, 0), family=family) as server:
+    with socket.create_server((host, 0), family=family) as server, reserved_port() as nothing:
         port = server.getsockname()[1]
-        nothing = free_port()
         addresses = [("127.0.0.1", nothing), ("::1", nothing), (host, port)]
         with connect(addresses, PATIENCE) as sock:
             assert sock.getpeername()[:2] == (host, port)
@@ -47,13 +47,13 @@ def test_an_address_without_an_answer_does_not_delay_the_other() -> None:
 
 
 def test_an_address_without_an_answer_times_out() -> None:
-    with black_hole() as silent, pytest.raises(TimeoutError):
-        connect([("127.0.0.1", port_of(silent)), ("::1", free_port())], 0.1)
+    with black_hole() as silent, reserved_port() as nothing, pytest.raises(TimeoutError):
+        connect([("127.0.0.1", port_of(silent)), ("::1", nothing)], 0.1)
 
 
 def test_where_all_refuse_the_error_says_so() -> None:
-    with pytest.raises(ConnectionRefusedError):
-        connect([("127.0.0.1", free_port()), ("::1", free_port())], PATIENCE)
+    with reserved_port() as nothing, pytest.raises(ConnectionRefusedError):
+        connect([("127.0.0.1", nothing), ("::1", nothing)], PATIENCE)
 
 
 def test_where_no_attempt_can_begin_the_first_error_says_so(
@@ -74,9 +74,10 @@ def test_where_no_attempt_can_begin_the_first_error_says_so(
 def test_an_agent_reaches_its_master_at_one_of_two_addresses(site: Site) -> None:
     listener, master = site.listener("[::1]:0")
     assert listener.address.startswith("[::1]:")
-    _, agent = site.dialer(f"127.0.0.1:{free_port()},{listener.address}")
-    agent.link.send(b"by IPv6")
-    master.wait(lambda: master.frames == [b"by IPv6"])
+    with reserved_port() as nothing:
+        _, agent = site.dialer(f"127.0.0.1:{nothing},{listener.address}")
+        agent.link.send(b"by IPv6")
+        master.wait(lambda: master.frames == [b"by IPv6"])
 
 
 def test_a_master_at_the_unspecified_ipv6_address_takes_both_families(site: Site) -> None:

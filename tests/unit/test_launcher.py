@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import gzip
 import http.client
 import io
@@ -19,6 +21,7 @@ from pathlib import Path
 import pytest
 
 from fakes.program_nodes import Launched, kill
+from faults.program import wait_for
 from fiber.launcher import (
     ALIVE,
     DROPPED,
@@ -65,14 +68,11 @@ class Pod:
 
     def connect(self) -> http.client.HTTPConnection:
         """A connection, as soon as the launcher listens."""
-        while True:
-            connection = http.client.HTTPConnection("127.0.0.1", self.launched.port, PATIENCE)
-            try:
-                connection.connect()
-            except ConnectionRefusedError:
-                assert self.launched.process.poll() is None, self.log()
-            else:
-                return connection
+        while (port := self.launched.port) is None:
+            assert self.launched.process.poll() is None, self.log()
+        connection = http.client.HTTPConnection("127.0.0.1", port, PATIENCE)
+        connection.connect()
+        return connection
 
     def ask(
         self, method: str, path: str, body: bytes | None = None, **headers: str
@@ -121,7 +121,7 @@ class Pod:
         return self.launched.process.wait(PATIENCE)
 
     def log(self) -> str:
-        return self.launched.log.read_text()
+        return self.launched.log.decode()
 
 
 def text(records: Records, kind: int = STDOUT) -> bytes:
@@ -212,7 +212,7 @@ def test_a_process_that_is_left_behind_does_not_keep_the_pod(site: Site) -> None
 
 
 def test_two_readers_get_everything(site: Site) -> None:
-    pod = site.python("import signal\nprint('one', flush=True)\nsignal.pause()")
+    pod = site.python("import os, signal\nos.write(1, b'one\\n')\nsignal.pause()")
     both: list[Records] = []
     told = threading.Semaphore(0)
 
@@ -271,6 +271,14 @@ def test_a_large_archive(site: Site) -> None:
     pod = site.pod(sys.executable, "-c", "import os; print(os.path.getsize('large'))")
     pod.start(archive(large=content))
     assert text(pod.read()) == b"%d\n" % (16 << 20)
+
+
+def test_output_that_is_no_text_arrives_unchanged(site: Site) -> None:
+    """An archive of results can be the output of a program."""
+    program = "import sys; sys.stdout.buffer.write(bytes(range(256)) * 4096)"
+    pod = site.pod(sys.executable, "-c", program)
+    pod.start()
+    assert text(pod.read()) == bytes(range(256)) * 4096
 
 
 @pytest.mark.parametrize(
@@ -375,7 +383,37 @@ def test_a_port_that_is_taken(tmp_path: Path) -> None:
     assert done.stderr.startswith("fiber run: cannot listen at port")
 
 
+def test_the_port_may_be_left_to_the_system(site: Site) -> None:
+    pod = site.shell("echo out")
+    assert (text(pod.read()), pod.log()) == (b"out\n", "out\n")
+    assert pod.launched.port
+
+
 # ---- signals and processes
+
+
+def send_to_another_thread(process: subprocess.Popen[bytes], number: int) -> None:
+    """Send a signal that does not interrupt what the main thread waits for.
+
+    A signal that comes just before the main thread waits does not interrupt it, either.
+    """
+    threads = map(int, os.listdir(f"/proc/{process.pid}/task"))
+    other = next(thread for thread in threads if thread != process.pid)
+    assert ctypes.CDLL(None).tgkill(process.pid, other, number) == 0
+
+
+def test_a_signal_just_before_the_wait_for_files_ends_the_pod(site: Site) -> None:
+    pod = site.pod("true")
+    assert pod.signal(999) == 400  # by now the main thread waits
+    send_to_another_thread(pod.launched.process, signal.SIGTERM)
+    assert pod.end() == 143
+
+
+def test_a_signal_just_before_the_wait_for_the_program_is_passed_on(site: Site) -> None:
+    pod = site.python("import signal\nprint(1, flush=True)\nsignal.pause()")
+    pod.read(until=b"1")
+    found = pod.read(begun=lambda: send_to_another_thread(pod.launched.process, signal.SIGTERM))
+    assert status_in(found) == pod.end() == 143
 
 
 def test_an_interrupt_reaches_the_group(site: Site) -> None:
@@ -476,8 +514,14 @@ def test_without_readers_old_output_is_dropped() -> None:
     assert rest[-2] == (STDERR, b"J" * 100)
 
 
-def test_the_program_waits_for_a_reader_that_takes_its_output() -> None:
+@pytest.mark.parametrize("reader", ["there", "expected", "broken off"])
+def test_the_program_waits_for_a_reader_that_takes_its_output(reader: str) -> None:
     output = Output(kept=1500, linger=3600)
+    if reader == "expected":
+        output.expect_reader()
+    elif reader == "broken off":
+        with pytest.raises(ConnectionError), output.reading(0):
+            raise ConnectionError
 
     def write() -> None:
         for number in range(100):
@@ -485,8 +529,13 @@ def test_the_program_waits_for_a_reader_that_takes_its_output() -> None:
         output.end(0)
 
     writer = threading.Thread(target=write)
-    with output.reading(0) as records:
+    with contextlib.ExitStack() as stack:
+        if reader == "there":
+            records = stack.enter_context(output.reading(0))
         writer.start()
+        if reader != "there":
+            wait_for(lambda: output._end >= 500)  # and that is too much to keep
+            records = stack.enter_context(output.reading(0))
         found = split(b"".join(records))
     writer.join()
     assert not text(found, DROPPED)
@@ -546,3 +595,39 @@ def test_the_end_waits_for_a_reader_that_broke_off_to_come_again() -> None:
     waiter.start()
     assert text(records_of(output)) == b"out"
     waiter.join()
+
+
+# ---- monitors
+
+
+WATCHED = """
+import os
+from fiber._monitor.server import MonitorServer
+from fiber._transport.loop import Loop
+
+folder = os.environ["TMPDIR"] + "/fiber-watched"
+os.mkdir(folder, 0o700)
+loop = Loop()
+server = MonitorServer(loop, folder, lambda request: [{"answer": request}])
+print("listens", flush=True)
+loop.run()
+"""
+
+
+def test_a_question_is_passed_on_to_the_programs_monitor(
+    site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    pod = site.python(WATCHED)
+    pod.read(until=b"listens")
+    question = {"Content_Length": "16"}
+    with pod.ask("POST", "/monitor", b'{"ask": "stack"}', **question) as response:
+        answers = [json.loads(line) for line in response]
+    assert {"answer": {"ask": "stack"}} in answers
+
+
+@pytest.mark.parametrize("size", ["70000", "-1", "many"])
+def test_a_question_that_cannot_be_is_refused(site: Site, size: str) -> None:
+    pod = site.pod("true")
+    with pod.ask("POST", "/monitor", b"nonsense", Content_Length=size) as response:
+        assert response.status == 400

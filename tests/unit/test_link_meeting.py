@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import socket
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -20,7 +20,8 @@ from fiber._transport.link import Keepalive
 from fiber._transport.loop import Loop
 from fiber.errors import AuthenticationError, ConfigError, LinkError, VersionMismatch
 from patience import PATIENCE
-from unit.link_site import Site, black_hole, free_port, port_of, say, vanish
+from ports import reserved_port
+from unit.link_site import Site, black_hole, port_of, say, vanish
 
 
 def test_a_port_in_use_is_named(site: Site) -> None:
@@ -43,16 +44,21 @@ def test_an_invalid_address_is_refused(site: Site, address: str) -> None:
         site.dialer(address)
 
 
-def test_a_master_that_comes_later_is_found(site: Site) -> None:
-    address = f"127.0.0.1:{free_port()}"
+@pytest.fixture
+def address() -> Iterator[str]:
+    """An address at which nothing listens yet."""
+    with reserved_port() as port:
+        yield f"127.0.0.1:{port}"
+
+
+def test_a_master_that_comes_later_is_found(site: Site, address: str) -> None:
     _, agent = site.dialer(address)
     _, master = site.listener(address)
     agent.link.send(b"found you")
     master.wait(lambda: master.frames == [b"found you"])
 
 
-def test_the_dialer_gives_up_without_a_listener(site: Site) -> None:
-    address = f"127.0.0.1:{free_port()}"
+def test_the_dialer_gives_up_without_a_listener(site: Site, address: str) -> None:
     _, agent = site.dialer(address, timeout=0.3)
     agent.wait(lambda: agent.errors)
     assert isinstance(agent.errors[0], LinkError)
@@ -120,10 +126,9 @@ def test_an_address_without_an_answer_is_soon_asked_again(
 
 @pytest.mark.parametrize("before", ["the first welcome", "another welcome"])
 def test_a_host_that_vanishes_before_the_welcome_is_dialled_anew(
-    site: Site, monkeypatch: pytest.MonkeyPatch, before: str
+    site: Site, monkeypatch: pytest.MonkeyPatch, address: str, before: str
 ) -> None:
     monkeypatch.setattr(dialer, "_GREET", 0.3)
-    address = f"127.0.0.1:{free_port()}"
     with contextlib.ExitStack() as held:
         if before == "another welcome":
             listener, former = site.listener(address, Keepalive())

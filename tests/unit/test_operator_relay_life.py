@@ -11,7 +11,9 @@ from fakes.kubernetes_api import Call, Fault
 from fakes.store import Body, Failure
 from fakes.world import NAMESPACE, TEMPLATE, World, a_world, played
 from fiber_api import names
+from fiber_api.names import Reason
 from fiber_operator.dependents import CHECK_INTERVAL
+from fiber_operator.planning import messages, relay
 from unit.operator_objects import MASTER
 
 RELAY = "es-fiber-relay"
@@ -101,13 +103,13 @@ async def test_a_relay_comes_and_goes_with_its_field(world: World) -> None:
 
 
 @played
-async def test_a_pool_that_is_made_with_a_relay_costs_one_call_more(world: World) -> None:
+async def test_a_pool_that_is_made_with_a_relay_costs_one_object_more(world: World) -> None:
     await a_relayed_pool(world)
     assert leads_to_the_relay(world)
     made = ["deployments", "endpointslices", "services"]
     assert sorted(calls(world)) == [("create", plural) for plural in made]
-    # A created object is not read.
-    assert world.api.count("get", "deployments") == 0
+    # Its pod may be refused, so it is read once soon after it was made.
+    assert world.api.count("get", "deployments") == 1
     world.api.calls.clear()
     await world.settled(3 * LATER)
     assert calls(world) == []
@@ -420,3 +422,121 @@ def test_an_operator_finds_a_relay_that_no_status_names() -> None:
             await world.until(lambda: leads_to_the_master(world), within=30)
 
     virtual_time.run(main())
+
+
+# -- Pods that the API server refuses
+
+QUOTA = (
+    f'pods "{RELAY}-7c9f-x2" is forbidden: exceeded quota: team, requested: pods=1, used: pods=9, '
+    "limited: pods=9"
+)
+
+
+def refuse(world: World, words: str = "") -> None:
+    """Give the Deployment the status that the cluster writes; without words its pod is made."""
+    generation = relays(world)[0]["metadata"]["generation"]
+    failure = {"type": "ReplicaFailure", "status": "True", "reason": "FailedCreate"}
+    conditions = [{**failure, "message": words}] if words else []
+    status = {"observedGeneration": generation, "conditions": conditions}
+    world.store.set_status("deployments", NAMESPACE, RELAY, status)
+
+
+def warnings(world: World) -> list[str]:
+    return [e["reason"] for e in world.store.list("events") if e["type"] == "Warning"]
+
+
+@played
+async def test_a_relay_whose_pod_is_refused_is_a_problem_soon(world: World) -> None:
+    world.make_pool(replicas=2, master=MASTER)
+    await world.ready(2)
+    world.edit(relay=True, replicas=3)
+    await world.until(lambda: len(relays(world)) == 1)
+    refuse(world, QUOTA)
+    await world.until(lambda: world.reasons() == ["QuotaExceeded"], within=10)
+    (problem,) = world.status()["problems"]
+    assert problem["message"] == (
+        f"A quota of the namespace leaves no room for the pod of the relay {RELAY}: exceeded "
+        "quota: team, requested: pods=1, used: pods=9, limited: pods=9. Delete objects that are "
+        "not needed, lower replicas, or raise the ResourceQuota. Kubernetes tries again by "
+        "itself. Running workers go on; no new ones are created until the relay has its pod."
+    )
+    assert (problem["severity"], problem["terminal"]) == ("Error", False)
+    await world.until(lambda: warnings(world) == ["QuotaExceeded"])
+    refuse(world)
+    await world.until(lambda: world.reasons() == [], within=10)
+    assert leads_to_the_relay(world)
+
+
+@played
+async def test_a_relay_that_loses_its_pod_and_gets_no_other_is_a_problem(world: World) -> None:
+    await a_relayed_pool(world)
+    refuse(world)
+    await world.settled(LATER)
+    assert world.reasons() == []
+    refuse(world, QUOTA)
+    await world.until(lambda: world.reasons() == ["QuotaExceeded"], within=LATER)
+    assert world.status()["relay"] == RELAY
+    world.edit(replicas=3)
+    await world.settled(LATER)
+    assert len(world.created()) == 2
+    refuse(world)
+    await world.ready(3)
+    assert world.reasons() == []
+
+
+@pytest.mark.parametrize(
+    ("words", "reason", "message", "terminal"),
+    [
+        (
+            'pods "a" is forbidden: failed quota: team: must specify limits.cpu for: relay',
+            Reason.REQUESTS_MISSING,
+            "counts resources that the pod of the relay r does not request: failed quota: team",
+            True,
+        ),
+        (
+            'pods "a" is forbidden: violates PodSecurity "restricted:latest": runAsNonRoot',
+            Reason.FORBIDDEN,
+            'forbids the pod of the relay r: violates PodSecurity "restricted:latest"',
+            True,
+        ),
+        (
+            'admission webhook "no.example" denied the request: not here',
+            Reason.FORBIDDEN,
+            "not here. Correct the cause that it names",
+            True,
+        ),
+        (
+            'pods "a" is forbidden: error looking up service account team/x: serviceaccount "x" '
+            "not found",
+            Reason.FORBIDDEN,
+            "error looking up service account",
+            False,
+        ),
+        (
+            'Pod "a" is invalid: spec.x: Invalid value',
+            Reason.INVALID_TEMPLATE,
+            "refuses the pod of the relay r: spec.x: Invalid value. The pod is made from",
+            True,
+        ),
+        (
+            'Internal error occurred: failed calling webhook "w"',
+            Reason.API_UNAVAILABLE,
+            "does not create the pod of the relay r: Internal error occurred: failed calling",
+            False,
+        ),
+    ],
+)
+def test_the_refusal_of_a_relays_pod_has_the_reason_of_a_workers(
+    words: str, reason: Reason, message: str, terminal: bool
+) -> None:
+    found = messages.refused_relay_pod(words, "r")
+    assert (found.reason, found.terminal) == (reason, terminal)
+    assert message in found.message
+    assert found.message.endswith(".")
+
+
+@pytest.mark.parametrize("value", [None, True, 1, "x", [None], [{}], [{"type": []}], {"a": 1}])
+def test_a_malformed_status_of_a_relay_does_not_raise(value: object) -> None:
+    for status in (value, {"conditions": value, "observedGeneration": value}):
+        assert relay.refusal({"status": status}) == ""
+        assert not relay.is_observed({"status": status, "metadata": {"generation": 3}})

@@ -436,6 +436,50 @@ def refused_relay(error: Invalid, name: str) -> Obstacle:
     return Obstacle(Reason.INVALID_TEMPLATE, message)
 
 
+_RELAY_REFUSALS: Mapping[Reason, tuple[str, str]] = {
+    Reason.INVALID_TEMPLATE: (
+        "The API server refuses the pod of the relay {name}",
+        "The pod is made from spec.template: correct that.",
+    ),
+    Reason.QUOTA_EXCEEDED: (
+        "A quota of the namespace leaves no room for the pod of the relay {name}",
+        "Delete objects that are not needed, lower replicas, or raise the ResourceQuota. "
+        "Kubernetes tries again by itself.",
+    ),
+    Reason.REQUESTS_MISSING: (
+        "A quota of the namespace counts resources that the pod of the relay {name} does not "
+        "request",
+        "Add these resources to resources.limits of the worker's container in spec.template: the "
+        "relay has a limit where the worker has one. A LimitRange of the namespace can give "
+        "defaults.",
+    ),
+    Reason.FORBIDDEN: (
+        "The API server forbids the pod of the relay {name}",
+        "Correct the cause that it names: a policy of the namespace, or spec.template, from which "
+        "the pod is made.",
+    ),
+}
+
+_REFUSES = re.compile(r" is (forbidden|invalid): | denied the request")
+"""Words of the API server after which the same pod is refused again."""
+
+_NO_RELAY = "Running workers go on; no new ones are created until the relay has its pod."
+
+
+def refused_relay_pod(words: str, name: str) -> Obstacle:
+    """Return the obstacle of a Deployment whose pod is not created; ``words`` say why."""
+    if not _REFUSES.search(words):
+        message = (
+            f"The API server does not create the pod of the relay {name}{quoted(words)}. "
+            f"{_NO_RELAY} {_WEBHOOKS.format(what='pods')}"
+        )
+        return Obstacle(Reason.API_UNAVAILABLE, message)
+    refused = PodRefusal("", 422 if " is invalid: " in words else 403, words, 0.0)
+    what, remedy = _RELAY_REFUSALS[refused.reason]
+    message = f"{what.format(name=name)}{quoted(_OF_THE_POD.sub('', words))}. {remedy} {_NO_RELAY}"
+    return Obstacle(refused.reason, message, refused.terminal)
+
+
 def creation_obstacle(error: ApiError) -> Obstacle:
     """Return the obstacle after a failed creation of a pod."""
     message = (

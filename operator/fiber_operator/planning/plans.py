@@ -63,6 +63,11 @@ class PodRefusal:
         return self.lacks_account or (self.status not in (403, 422) and not self.dry_run)
 
     @property
+    def terminal(self) -> bool:
+        """True if another try cannot succeed."""
+        return self.reason != Reason.QUOTA_EXCEEDED and not self.may_pass
+
+    @property
     def lacks_account(self) -> bool:
         """True if the template's ServiceAccount does not exist, or not yet."""
         return _NO_ACCOUNT_YET in self.message
@@ -77,8 +82,7 @@ class PodRefusal:
 class Obstacle:
     """Obstacle for the operator, such as an object of the pool that could not be created.
 
-    ``reason`` is ``Reason.NAME_TAKEN``, ``INVALID_CREDENTIALS``, ``FORBIDDEN`` or
-    ``API_UNAVAILABLE``; the last counts as an error only if it lasts.  ``message`` says what
+    The reason ``API_UNAVAILABLE`` counts as an error only if it lasts.  ``message`` says what
     happened, why, and what to do; it is shown unchanged.
     """
 

@@ -148,7 +148,7 @@ def _refusals(situation: Situation) -> Iterator[Problem]:
             reason,
             messages.refusal(reason, refused),
             severity=situation.severity(reason) if refused.lacks_account else "Error",
-            terminal=reason != Reason.QUOTA_EXCEEDED and not refused.may_pass,
+            terminal=refused.terminal,
         )
 
 

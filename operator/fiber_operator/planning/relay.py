@@ -108,6 +108,20 @@ def may_stay(pool: FiberPool, existing: Mapping[str, Any], wanted: Mapping[str, 
     return same and mapping(existing, "spec").get("replicas") == _REPLICAS
 
 
+def is_observed(existing: Mapping[str, Any]) -> bool:
+    """Return True if the cluster has acted on the Deployment as it is."""
+    generation = mapping(existing, "metadata").get("generation")
+    return mapping(existing, "status").get("observedGeneration", 0) == generation
+
+
+def refusal(existing: Mapping[str, Any]) -> str:
+    """Return why the pod of the Deployment is not created; empty if nothing prevents that."""
+    for condition in items(mapping(existing, "status").get("conditions")):
+        if condition.get("type") == "ReplicaFailure" and condition.get("status") == "True":
+            return text(condition.get("message")) or "its Deployment does not say why"
+    return ""
+
+
 def _revision(document: Mapping[str, Any]) -> str:
     return text(mapping(document, "metadata", "labels").get(names.LABEL_TEMPLATE_HASH))
 

@@ -176,6 +176,8 @@ class Agent:
             self._child_exited(child, reply[2], reason, stack=stack)
         elif reply[0] == zygote.FAILED:
             self._refused(child, reply[2])
+        elif reply[0] == zygote.STACK:
+            child.observer.showed_stack(reply[2])
         elif reply[0] == zygote.FORK_UNSAFE:
             self._restart_elsewhere(child, reply[2])
 

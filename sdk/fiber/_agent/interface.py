@@ -121,6 +121,9 @@ class ChildObserver(Protocol):
     def recalled(self, seqs: list[int]) -> None:
         """Take the answer to ``recall``: the packets that the child will never read."""
 
+    def showed_stack(self, text: str) -> None:
+        """Take the Python stacks of the child, which got the signal ``last_words.SHOW``."""
+
     def draining(self) -> None:
         """Take note that the child's host is about to end: send the child no more tasks."""
 

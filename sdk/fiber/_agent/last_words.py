@@ -1,7 +1,8 @@
 """Reasons for the death of a child: its Python stacks, its running task, the memory limit.
 
 The zygote makes a memory file for each child.  faulthandler writes the stacks of all threads there,
-also at a crash in native code, and the zygote reads them when the child is gone.
+also at a crash in native code, and the zygote reads them when the child is gone.  SHOW asks a child
+that lives on for its stacks.
 
 The progress table is shared memory in which each pool worker notes its running task.  A note costs
 a store into memory.  When a worker dies, its agent reads here which task to blame.
@@ -22,13 +23,19 @@ from contextlib import suppress
 TELL = signal.SIGRTMAX - 3
 """Signal to a child: write the stacks, then die."""
 
+SHOW = signal.SIGRTMAX - 4
+"""Signal to a child: write the stacks, and go on."""
+
 GRACE = 0.5
 """Seconds from TELL to SIGKILL."""
 
 LIMIT = 1 << 14
 """Bytes of the stacks that the zygote keeps."""
 
-_HERE = os.path.dirname(__file__)
+_HERE = os.path.dirname(os.path.abspath(__file__))
+
+_PACKAGE = f'  File "{os.path.dirname(_HERE)}{os.sep}'
+"""Start of the lines of a stack that show Fiber's code."""
 
 _OUR_FRAMES = tuple(
     f'  File "{os.path.normpath(os.path.join(_HERE, place))}'
@@ -45,12 +52,16 @@ def make_file() -> int:
 
 
 def write_to(fd: int) -> None:
-    """Have faulthandler write to ``fd`` on TELL, and on crashes unless the user enabled it."""
+    """Have faulthandler write to ``fd`` on TELL and SHOW, and on crashes.
+
+    Crashes stay the user's if the user enabled faulthandler.
+    """
     import faulthandler
 
     with suppress(OSError, RuntimeError, ValueError):  # stacks are optional
         signal.signal(TELL, signal.SIG_DFL)
         faulthandler.register(TELL, file=fd, all_threads=True, chain=True)
+        faulthandler.register(SHOW, file=fd, all_threads=True)
         if not faulthandler.is_enabled():
             faulthandler.enable(file=fd, all_threads=True)
 
@@ -58,11 +69,74 @@ def write_to(fd: int) -> None:
 def read(fd: int) -> str:
     """Return what a child has written, and close its file."""
     try:
+        return _text_in(fd)
+    finally:
+        os.close(fd)
+
+
+class StackRequest:
+    """Request for the stacks of a child that lives on; ``fd`` is the child's file.
+
+    faulthandler does not say that it has finished.  So the stacks count as whole once the file has
+    not grown between two looks.
+    """
+
+    INTERVAL = 0.05
+    """Seconds between two looks."""
+
+    def __init__(self, pid: int, fd: int, now: float) -> None:
+        self.due = now + self.INTERVAL
+        """Time of the next look."""
+        self._pid = pid
+        self._fd = fd
+        self._deadline = now + _PATIENCE
+        self._size = 0
+        _empty(fd)
+
+    def look(self, now: float) -> str | None:
+        """Return the stacks, or why there are none; None: look again when it is ``due``."""
+        before, self._size = self._size, os.fstat(self._fd).st_size
+        if self._size and self._size == before:
+            text = _text_in(self._fd)
+            _empty(self._fd)
+            return text if _has_user_code(text) else "Only Fiber's code runs: it waits for work."
+        if now >= self._deadline:
+            return f"No stack came within {_PATIENCE:.0f} s: the process {_activity(self._pid)}."
+        self.due = now + self.INTERVAL
+        return None
+
+
+_PATIENCE = 3.0
+"""Seconds in which a child writes its stacks."""
+
+
+def _activity(pid: int) -> str:
+    """Return what the kernel says that a process does."""
+    state = _read(f"/proc/{pid}/stat").rpartition(")")[2].strip()[:1]
+    return {
+        "D": "waits for a device or a network file system",
+        "T": "is stopped by a signal",
+        "t": "is stopped by a debugger",
+        "Z": "has ended",
+    }.get(state, "still starts, or it has changed the handler of Fiber's signal")
+
+
+def _has_user_code(stacks: str) -> bool:
+    frames = [line for line in stacks.splitlines() if line.startswith("  ")]
+    return not all(frame.startswith(_PACKAGE) for frame in frames)
+
+
+def _empty(fd: int) -> None:
+    os.ftruncate(fd, 0)
+    os.lseek(fd, 0, os.SEEK_SET)  # the child writes at the same position
+
+
+def _text_in(fd: int) -> str:
+    """Return the stacks in a file, without Fiber's frames."""
+    try:
         data = os.pread(fd, LIMIT + 1, 0)
     except OSError:
         return ""
-    finally:
-        os.close(fd)
     lines = _without_our_frames(data[:LIMIT].decode(errors="replace").splitlines())
     if len(data) > LIMIT:
         lines[-1:] = ["..."]

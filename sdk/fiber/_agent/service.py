@@ -283,6 +283,10 @@ class _Observed:
         """Send the answer to a recall to the master."""
         self._service.send(messages.Recalled(self._number, tuple(seqs)))
 
+    def showed_stack(self, text: str) -> None:
+        """Send the child's stacks to the master."""
+        self._service.send(messages.ShownStack(self._number, text))
+
     def draining(self) -> None:
         """Do nothing: this agent itself tells the master that its host is about to end."""
 

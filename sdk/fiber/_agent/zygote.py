@@ -19,8 +19,8 @@ Packets to the agent:
 * ``(STARTED, child, pid)``
 * ``(FAILED, child, text)``; ``child`` is None if the request was lost: then it is about the first
   child that is not answered yet
+* ``(STACK, child, text)``: the Python stacks of a child that got SHOW (``last_words.py``)
 * ``(EXITED, child, exit code)``, and the Python stacks if the child has written them
-  (``last_words.py``)
 * ``(FORK_UNSAFE, child, imports)``: this zygote's imports made forking unsafe.  The agent starts
   that child in a zygote that imports ``imports`` alone.
 """
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     import tarfile
 
 SETUP, START, SIGNAL, DESCRIPTORS, QUIT = range(5)
-STARTED, FAILED, EXITED, FORK_UNSAFE = range(4)
+STARTED, FAILED, EXITED, FORK_UNSAFE, STACK = range(5)
 
 _SHUTDOWN_SIGNALS = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 
@@ -91,6 +91,7 @@ class Zygote:
         self._children: dict[int, int] = {}  # pid -> child
         self._words: dict[int, int] = {}  # pid -> file for the stacks of a crash
         self._overdue: dict[int, float] = {}  # pid -> time of its SIGKILL, if it is still alive
+        self._requests: dict[int, last_words.StackRequest] = {}  # pid -> request for its stacks
         self._descriptors: tuple[int, list[int]] = (0, [])  # child, descriptors before its START
         self._sigchld, self._sigchld_in = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
         self._poller = select.poll()
@@ -108,6 +109,7 @@ class Zygote:
             if self._sigchld in ready:
                 self._reap()
             self._kill_overdue()
+            self._answer_requests()
             try:
                 if self._control.fileno() in ready and not self._serve():
                     self._kill_children(0)
@@ -128,8 +130,10 @@ class Zygote:
             signal.signal(signum, signal.SIG_IGN)
         # A terminal with `stty tostop` stops background process groups that print.
         signal.signal(signal.SIGTTOU, signal.SIG_IGN)
-        # A new child ignores TELL until ``_run_child`` has reset its signal handlers.
+        # A new child ignores TELL until ``_run_child`` has reset its signal handlers.  It ignores
+        # SHOW until faulthandler handles it.
         signal.signal(last_words.TELL, signal.SIG_IGN)
+        signal.signal(last_words.SHOW, signal.SIG_IGN)
         signal.signal(signal.SIGCHLD, lambda *_: None)
         signal.set_wakeup_fd(self._sigchld_in, warn_on_full_buffer=False)
 
@@ -237,17 +241,35 @@ class Zygote:
 
     def _signal(self, child: int, signum: int) -> None:
         pid = self._pids.get(child)
-        if pid is None:
+        if pid is None or (signum == last_words.SHOW and not self._request_stack(pid)):
             return
         if signum == last_words.TELL:
             self._overdue[pid] = time.monotonic() + last_words.GRACE
         _kill(pid, signum)
 
+    def _request_stack(self, pid: int) -> bool:
+        """Note that a child is asked for its stacks; return False if it was asked before."""
+        words = self._words.get(pid, -1)
+        if words < 0:
+            self._reply(
+                STACK, self._children[pid], "No stack: the system had no room for its file."
+            )
+        elif pid not in self._requests:
+            self._requests[pid] = last_words.StackRequest(pid, words, time.monotonic())
+            return True
+        return False
+
+    def _answer_requests(self) -> None:
+        now = time.monotonic()
+        for pid, request in list(self._requests.items()):
+            if request.due <= now and (text := request.look(now)) is not None:
+                del self._requests[pid]
+                self._reply(STACK, self._children[pid], text)
+
     def _patience(self) -> float | None:
-        """Return the milliseconds until a child is to be killed."""
-        if not self._overdue:
-            return None
-        return max(0.0, min(self._overdue.values()) - time.monotonic()) * 1000
+        """Return the milliseconds until a child is to be killed, or a request to be looked at."""
+        due = [*self._overdue.values(), *(request.due for request in self._requests.values())]
+        return max(0.0, min(due) - time.monotonic()) * 1000 if due else None
 
     def _kill_overdue(self) -> None:
         now = time.monotonic()
@@ -273,6 +295,7 @@ class Zygote:
         if child is None:
             return
         self._pids.pop(child, None)
+        self._requests.pop(pid, None)
         exitcode = os.waitstatus_to_exitcode(status)
         if self._overdue.pop(pid, None) is not None and exitcode == -last_words.TELL:
             exitcode = -signal.SIGKILL  # TELL is how the agent begins to kill it

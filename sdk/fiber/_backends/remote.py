@@ -373,6 +373,8 @@ class RemoteChild:
             self.observer.started(message.pid)
         elif isinstance(message, messages.Recalled):
             self.observer.recalled(list(message.seqs))
+        elif isinstance(message, messages.ShownStack):
+            self.observer.showed_stack(message.text)
         elif isinstance(message, messages.ChildOutput):
             output.write(f"{self.name}@{self.host}", message.text)
         elif isinstance(message, messages.Exited) and self._may_begin_elsewhere(message):

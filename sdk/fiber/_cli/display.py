@@ -35,6 +35,16 @@ def table(rows: Sequence[Sequence[str]], columns: Sequence[str]) -> str:
     )
 
 
+def utc(seconds: float) -> str:
+    """Return a unix time as Kubernetes writes it."""
+    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(seconds))
+
+
+def counted(number: int, noun: str) -> str:
+    """Return a number with its noun: ``1 worker``, ``2 workers``."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
 def age(since: float | None) -> str:
     """Return how long ago a unix time was, as kubectl writes it; empty for None."""
     if since is None:

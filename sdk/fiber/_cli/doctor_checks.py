@@ -10,6 +10,7 @@ from typing import NamedTuple
 import fiber
 from fiber._backends.kubernetes.published import install_command
 from fiber._backends.kubernetes.template import ImageMissing
+from fiber._cli.display import counted
 from fiber._cli.doctor_capacity import refusing_quota, refusing_range, requests_of, room
 from fiber._cli.doctor_facts import Answer, Facts, FirstAnswer, NoPlace, Place
 from fiber._cli.doctor_rights import (
@@ -22,7 +23,7 @@ from fiber._cli.doctor_rights import (
     SPEC_OF_PROGRAMS,
     Right,
 )
-from fiber._cli.doctor_verdicts import State, Verdict, fault, ok, unknown
+from fiber._cli.doctor_verdicts import State, Verdict, fault, note, ok, unknown
 from fiber._cli.failures import no_image
 from fiber._cli.pool_access import account_of_program, condition, is_of_program, program_of
 from fiber.config import Config
@@ -304,7 +305,7 @@ def _special_rights(facts: Facts) -> Iterator[Verdict]:
 
 
 def _run_rights(facts: Facts) -> Iterator[Verdict]:
-    yield from _rights(facts, RUN_RIGHTS, "`fiber run`")
+    yield from _rights(facts, RUN_RIGHTS, "only `fiber run`")
 
 
 def _rights(facts: Facts, wanted: Sequence[Right], who: str) -> Iterator[Verdict]:
@@ -314,8 +315,9 @@ def _rights(facts: Facts, wanted: Sequence[Right], who: str) -> Iterator[Verdict
         yield unknown(f"the API server does not say which rights this account has{why}")
         return
     missing = [right for right in wanted if not facts.rights.get(right, True)]
+    judge = note if wanted is RUN_RIGHTS else fault
     for right in missing:
-        yield fault(
+        yield judge(
             f"this account may not {right}",
             f"{right.only or who} needs this in the namespace {facts.place.namespace!r}",
             _remedy(facts.place.namespace, wanted),
@@ -340,7 +342,7 @@ def _account(facts: Facts) -> Iterator[Verdict]:
     missing = [str(right) for right in ACCOUNT_RIGHTS if not rights.get(right, True)]
     match facts.account:
         case NotFound() if missing:
-            yield fault(
+            yield note(
                 f"there is no account {name!r}, as which `fiber run` runs programs",
                 f"this account may not make it: it may not {', nor '.join(missing)}",
                 f"ask an administrator: `kubectl create serviceaccount {name} -n {namespace}` and "
@@ -394,8 +396,8 @@ def _quota(facts: Facts) -> Iterator[Verdict]:
     if unread and not (full or outside):
         yield unknown(f"this account may not list the {' and '.join(unread)} of the namespace")
     elif not (full or outside):
-        number = f"{len(quotas or ())} quotas and {len(ranges or ())} LimitRanges"
-        yield ok(f"{number}, none refuses a worker")
+        both = counted(len(quotas or ()), "quota"), counted(len(ranges or ()), "LimitRange")
+        yield ok(f"{' and '.join(both)}, none refuses a worker")
 
 
 def _nodes(facts: Facts) -> Iterator[Verdict]:
@@ -471,7 +473,7 @@ def _objection(wanted: str | None, pools: Mapping[str, Body]) -> Verdict | None:
 def _use(pool: Body) -> str:
     ready = (pool.get("status") or {}).get("readyReplicas") or 0
     use = "free" if program_of(pool) is None else f"used by {account_of_program(pool)}"
-    return f"{ready} workers ready, {use}"
+    return f"{counted(ready, 'worker')} ready, {use}"
 
 
 def _list(answer: Answer | None) -> list[Body] | None:

@@ -32,6 +32,7 @@ from fiber._cli.doctor_rights import (
     SCHEMA,
     Right,
 )
+from fiber._cli.session import SECONDS
 from fiber.config import Config
 from fiber.errors import ConfigError
 from fiber_api import names
@@ -51,9 +52,6 @@ from fiber_api.rest import (
 
 Answer = Body | ApiError
 """Document of the API server, or its error."""
-
-SECONDS = 5.0
-"""Seconds for one call."""
 
 _AT_ONCE = 8
 """Calls at one time."""

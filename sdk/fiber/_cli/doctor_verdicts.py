@@ -11,15 +11,16 @@ class State(StrEnum):
     """Outcome of a check."""
 
     OK = "ok"
+    NOTE = "note"
     FAULT = "fault"
     UNKNOWN = "unknown"
 
 
-MARKS = {State.OK: "✓", State.FAULT: "✗", State.UNKNOWN: "-"}
+MARKS = {State.OK: "✓", State.NOTE: "!", State.FAULT: "✗", State.UNKNOWN: "-"}
 
 
 class Verdict(NamedTuple):
-    """Outcome in words: what was found and, for a fault, why it is one and what to do."""
+    """Outcome in words: what was found and, for a fault or a note, why and what to do."""
 
     state: State
     what: str
@@ -49,6 +50,11 @@ def ok(what: str) -> Verdict:
     return Verdict(State.OK, what)
 
 
+def note(what: str, why: str, do: str) -> Verdict:
+    """Return the verdict of a check that found what only some users have to mend."""
+    return Verdict(State.NOTE, what, why, do)
+
+
 def fault(what: str, why: str, do: str) -> Verdict:
     """Return the verdict of a check that found a fault."""
     return Verdict(State.FAULT, what, why, do)
@@ -60,7 +66,7 @@ def unknown(what: str) -> Verdict:
 
 
 def lines_of(verdicts: Iterable[Verdict]) -> Iterator[str]:
-    """Yield the lines for people.  Faults with one reason and remedy have these once, below."""
+    """Yield the lines for people.  Verdicts with one reason and remedy have these once, below."""
     found = list(verdicts)
     for verdict, following in zip(found, [*found[1:], None], strict=True):
         yield verdict.line

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 
 import click
 
-from fiber._cli import streams
+from fiber._cli import local_logs, streams
 from fiber._cli.failures import USAGE, CommandError, explained, not_found
+from fiber._cli.local import find_local
 from fiber._cli.log_following import follow_log
 from fiber._cli.programs import find_job, find_pod
 from fiber._cli.ps import host_of, list_pools
@@ -35,13 +37,18 @@ def command(
 ) -> int:
     """Show the output of a program that `fiber run` started, or of a worker.
 
-    A program that has ended keeps its log for an hour.
+    A program in a pod that has ended keeps its log for an hour.  A program of this machine has a
+    log if its output goes to a file.
 
     \b
     Examples:
       fiber logs train-4f2a1 --follow
       fiber logs train-4f2a1 --worker train-1c0de-9e107d9d37 --since 5m
     """
+    if (program := find_local(name, context, namespace)) is not None:
+        return _passing_on(
+            lambda: local_logs.show(program, worker=worker, follow=follow, since=since)
+        )
     container = names.WORKER_CONTAINER if worker else names.PROGRAM_CONTAINER
     query = {"container": container}
     if since is not None:
@@ -49,9 +56,13 @@ def command(
     session = connect(context, namespace)
     find_job(session, name)
     pod = _worker(session, name, worker) if worker else _pod(session, name)
+    with explained(f"read the log of {pod}"):
+        return _passing_on(lambda: _show(session, pod, query, follow))
+
+
+def _passing_on(show: Callable[[], None]) -> int:
     try:
-        with explained(f"read the log of {pod}"):
-            _show(session, pod, query, follow)
+        show()
     except streams.OutputClosed:
         return _BROKEN_PIPE
     return 0

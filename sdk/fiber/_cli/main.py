@@ -15,9 +15,10 @@ if TYPE_CHECKING:
 
 _COMMANDS = {
     "run": "Run a program in a pod, and follow it.",
-    "ps": "List the programs of a namespace.",
+    "ps": "List the programs of this machine and of the cluster.",
     "logs": "Show the output of a program, or of a worker.",
     "stop": "End a program.",
+    "stack": "Show where a program and its workers are in their code.",
     "pool": "List, make and scale FiberPools.",
     "doctor": "Find out why programs do not get workers.",
     "image": "Build an image for workers from this environment.",

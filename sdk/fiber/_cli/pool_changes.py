@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import click
 
+from fiber._cli.display import counted
 from fiber._cli.pool_access import account_of_program, opened, patch, program_of
 from fiber._cli.session import cluster_options
 from fiber_api.rest import Body
@@ -28,7 +29,7 @@ def scale(name: str, workers: int, namespace: str | None, context: str | None) -
     """
     session = opened(context, namespace)
     found = patch(session, name, {"replicas": workers}, "scale")
-    click.echo(f"the FiberPool {name!r} is asked for {workers} workers")
+    click.echo(f"the FiberPool {name!r} is asked for {counted(workers, 'worker')}")
     for note in _notes(name, workers, found):
         click.echo(f"  note: {note}", err=True)
 

@@ -17,6 +17,7 @@ from fiber._backends.kubernetes.template import (
     pod_template,
     quantity,
 )
+from fiber._cli.display import counted
 from fiber._cli.failures import CommandError, explained, no_image
 from fiber._cli.pool_access import (
     change,
@@ -87,10 +88,10 @@ def warm(
     wishes = Resources(cpu=cpu, memory=memory, gpu=gpu)
     session = opened(context, namespace)
     if find(session, name) is None and _made(session, name, workers, image, wishes):
-        click.echo(f"the FiberPool {name!r} is made, with {workers} workers")
+        click.echo(f"the FiberPool {name!r} is made, with {counted(workers, 'worker')}")
     else:
         change(session, name, lambda pool: _changes(pool, workers, image, wishes), "change")
-        click.echo(f"the FiberPool {name!r} is changed: it keeps {workers} workers")
+        click.echo(f"the FiberPool {name!r} is changed: it keeps {counted(workers, 'worker')}")
     click.echo(f"programs use it with FIBER_POOL={name}")
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import http.client
 import io
+import json
 import socket
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -162,6 +163,14 @@ class LauncherClient:
         """Send a signal to the program."""
         with self._asking("POST", f"/signal/{number}") as (_, get_response):
             get_response()
+
+    def monitor(self, request: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+        """Yield the answers of the monitors of the program's processes."""
+        body = json.dumps(request).encode()
+        headers = {"Content-Length": str(len(body))}
+        with self._asking("POST", "/monitor", io.BytesIO(body), headers) as (_, get_response):
+            for line in get_response():
+                yield json.loads(line)
 
     def output(self, position: int) -> Iterator[tuple[int, bytes]]:
         """Yield the kinds and contents of the output's records from ``position`` on.

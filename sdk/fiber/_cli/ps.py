@@ -1,4 +1,4 @@
-"""``fiber ps``: the programs of a namespace."""
+"""``fiber ps``: the programs of this machine and of a namespace."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from typing import Any
 
 import click
 
+from fiber._backends.kubernetes.api import Login
 from fiber._cli import display
-from fiber._cli.failures import explained
+from fiber._cli.failures import CommandError, explained
+from fiber._cli.local import local_programs
 from fiber._cli.programs import list_jobs
 from fiber._cli.session import Session, cluster_options, connect, output_option
 from fiber_api import names
@@ -22,23 +24,40 @@ _COLUMNS = ["name", "state", "workers", "host", "age", "command"]
 @cluster_options
 @output_option
 def command(namespace: str | None, context: str | None, output: str) -> None:
-    """List the programs of a namespace, and their workers.
+    """List the programs of this machine and of a namespace, and their workers.
 
-    Programs that `fiber run` started are in pods, and those that have ended are listed for an hour.
-    Other programs are listed by the FiberPools that they use.
+    A program of this machine is listed once it has started a process or a pool.  Programs that
+    `fiber run` started are in pods, and those that have ended are listed for an hour.  Other
+    programs are listed by the FiberPools that they use.
 
     \b
     Examples:
       fiber ps
       fiber ps --namespace team-a --output json
     """
-    session = connect(context, namespace)
-    jobs, pools = list_jobs(session), list_pools(session)
-    hosts = _hosts(session) if jobs else {}
-    rows = [*_of_jobs(jobs, pools, hosts), *_elsewhere(pools, jobs, hosts)]
-    display.show(rows, _COLUMNS, output, f"no program runs in {session.where}")
+    is_chosen = bool(context or namespace)
+    rows = [] if is_chosen else [program.row() for program in local_programs()]
+    places, failure = [] if is_chosen else ["on this machine"], None
+    if is_chosen or Login.is_configured():
+        try:
+            session = connect(context, namespace)
+            places.append(f"in {session.where}")
+            rows += _of_namespace(session)
+        except CommandError as error:
+            failure = error
+    if rows or failure is None:
+        display.show(rows, _COLUMNS, output, f"no program runs {' or '.join(places)}")
     if output == "table" and any(row["state"] == "running" and row["job"] for row in rows):
         click.echo("`fiber run --attach NAME` follows one again", err=True)
+    if failure is not None:
+        raise failure
+
+
+def _of_namespace(session: Session) -> list[dict[str, Any]]:
+    """Return a row for each program of the namespace."""
+    jobs, pools = list_jobs(session), list_pools(session)
+    hosts = _hosts(session) if jobs else {}
+    return [*_of_jobs(jobs, pools, hosts), *_elsewhere(pools, jobs, hosts)]
 
 
 def list_pools(session: Session) -> list[Body]:

@@ -8,6 +8,7 @@ import signal
 import click
 
 from fiber._cli.failures import explained
+from fiber._cli.local import end, find_local
 from fiber._cli.programs import LauncherClient, ProgramPod, find_job, find_pod, stop
 from fiber._cli.session import Session, cluster_options, connect
 from fiber_api.rest import ApiError
@@ -18,16 +19,20 @@ from fiber_api.rest import ApiError
 @click.option("--now", is_flag=True, help="Delete it, and do not ask it to end first.")
 @cluster_options
 def command(name: str, now: bool, namespace: str | None, context: str | None) -> None:
-    """End a program that `fiber run` started.
+    """End a program of this machine, or one that `fiber run` started in a pod.
 
-    The program gets SIGTERM, and its pod is kept with its log for an hour.  With --now the pod is
-    deleted.  Its workers end with it.
+    The program gets SIGTERM, and its workers end with it.  A pod is kept with its log for an hour.
+    With --now the program is killed and its pod deleted.
 
     \b
     Examples:
       fiber stop train-4f2a1
       fiber stop train-4f2a1 --now
     """
+    program = find_local(name, context, namespace)
+    if program is not None:
+        end(program, now=now)
+        return
     session = connect(context, namespace)
     job = find_job(session, name)
     pod = find_pod(session, name)

@@ -117,6 +117,14 @@ class Popen:
             self.exited(ExitReport(UNKNOWN, str(error)))
 
     @property
+    def state(self) -> str:
+        """State of the process: ``waiting`` for a host, ``starting`` or ``running``."""
+        child = self._child
+        if child is not None and child.waiting:
+            return "waiting"
+        return "starting" if self._pid is None else "running"
+
+    @property
     def leaving(self) -> str:
         """Reason for which the host is about to end; empty if the host stays."""
         child = self._child

@@ -6,22 +6,26 @@ was forked without Fiber (``os.fork``, multiprocessing) has none, and makes one 
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pickle
 import sys
 import threading
+from collections.abc import Iterator
 from dataclasses import replace
 from multiprocessing import process as mp_process
 from multiprocessing import spawn, util
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from fiber import _config_sources, _logs, config, reduction
 from fiber._agent import child
-from fiber._agent.interface import ChildHandle, ChildObserver, ChildSpec, ExitReport
+from fiber._agent.interface import ChildHandle, ChildSpec
 from fiber._hub import client as hub_client
-from fiber._hub.handles import GrantSet, collecting_grants
+from fiber._hub.handles import collecting_grants
 from fiber._hub.hub import Hub
+from fiber._monitor.server import MonitorServer
 from fiber._runtime import start_methods
+from fiber._runtime.children import Child, ChildOwner, Children
 from fiber._transport.channels import naming_the_limit
 from fiber._transport.loop import Loop
 from fiber._wire.memory_files import Blob
@@ -48,6 +52,10 @@ class Runtime:
         self.loop = Loop()
         self.host = child.host or "local"
         self.hub: Hub | None = None
+        self.children = Children()
+        self._monitor: MonitorServer | None = None
+        self._is_watchable = not child.host
+        """True until the monitor listens, or cannot."""
         try:
             self.hub = self._make_hub()
             self.backend: Backend = _make_backend(self)
@@ -97,6 +105,7 @@ class Runtime:
         error in pickling is raised here.  If the caller is interrupted, either no child starts, or
         ``begin`` is called, before any request that the caller makes later.
         """
+        self._listen_to_monitors()
         same_host = self.backend.same_host
         preparation, program = self._preparation(process, anew=not tasks)
         arguments = None if shared is None else shared.blob(same_host=same_host)
@@ -104,7 +113,7 @@ class Runtime:
             process._args = ()  # type: ignore[attr-defined]  # they go beside it
         with collecting_grants(reusable=False) as grants:
             payload, fds = reduction.dump_process(process, same_host=same_host)
-        observer = _Releasing(owner, grants) if grants else owner
+        observer = Child(self.children, owner, grants)
         spec = ChildSpec(
             name=process.name,
             method=method,
@@ -118,8 +127,24 @@ class Runtime:
             resources=resources_of(getattr(process, "_target", None) or process.run),
         )
         made = self.backend.child(spec, observer)
-        self.loop.call_soon(owner.begin, made)
+        self.loop.call_soon(observer.begin, made)
         return made
+
+    def _listen_to_monitors(self) -> None:
+        """Open the socket of the monitor, with the first child.  A program runs without it, too."""
+        if self.hub is None or not self._is_watchable:
+            return
+        self._is_watchable = False
+        if directory := os.path.dirname(self.hub.address_or_problem.path):
+            try:
+                self._monitor = MonitorServer(self.loop, directory, self._answer_monitor)
+            except OSError as error:
+                _logs.debug("this program cannot be watched: %s", error)
+
+    def _answer_monitor(self, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
+        from fiber._runtime.monitoring import Monitor  # rarely needed
+
+        return Monitor(self.loop, self.children, self.backend.name, self.config).answer(request)
 
     def _preparation(self, process: Any, *, anew: bool) -> tuple[bytes, PackedProgram | None]:
         """Return the preparation data of a child, and its files; ``anew`` as in ``Shipping``."""
@@ -170,7 +195,15 @@ class Runtime:
         _logs.debug("ending all processes and agents")
         self.backend.close()
         self.loop.stop()
+        if self._monitor is not None:
+            self._monitor.close()
         self._close_hub()
+
+    def forget(self) -> None:
+        """Close what a forked copy of this process must not hold."""
+        if self._monitor is not None:
+            with contextlib.suppress(OSError):
+                self._monitor.forget()
 
 
 class SharedArguments:
@@ -192,30 +225,6 @@ class SharedArguments:
                 self._blob = Blob(data)
             self._tried = True
         return self._blob
-
-
-class ChildOwner(ChildObserver, Protocol):
-    """Observer of a child that also starts it."""
-
-    def begin(self, child: ChildHandle) -> None:
-        """Keep the child's handle, and start it.  The loop calls this first of all."""
-
-
-class _Releasing:
-    """Observer that passes on all reports, and releases unused grants once the child has ended."""
-
-    def __init__(self, observer: ChildObserver, grants: GrantSet) -> None:
-        self.started = observer.started
-        self.received = observer.received
-        self.recalled = observer.recalled
-        self.draining = observer.draining
-        self._observer = observer
-        self._grants = grants
-
-    def exited(self, report: ExitReport) -> None:
-        """Note that the child has ended."""
-        self._grants.release()
-        self._observer.exited(report)
 
 
 def _make_backend(runtime: Runtime) -> Backend:
@@ -309,6 +318,8 @@ def shutdown() -> None:
 def _forget() -> None:
     """Forget the runtime after a fork without Fiber: the loop thread is not in the copy."""
     global _runtime, _lock, _may_link
+    if _runtime is not None:
+        _runtime.forget()
     _runtime, _lock = None, threading.RLock()
     _may_link = _may_link and "fiber._transport.nng" not in sys.modules
 

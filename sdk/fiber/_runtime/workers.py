@@ -118,6 +118,17 @@ class WorkerHandle:
         """Name of the worker's host; ``?`` while it is unknown."""
         return self.child.host if self.child is not None else "?"
 
+    @property
+    def state(self) -> str:
+        """State of the worker, as in ``WorkerInfo``."""
+        if self.child is None or self.child.waiting:
+            return "waiting"
+        if self.leaving:
+            return "leaving"
+        if self.worker is None:
+            return "starting"
+        return "busy" if self.worker.queue or self.worker.leased else "idle"
+
     def start(self, process: BaseProcess) -> None:
         """Start the worker as ``process``, a Process object that was made for this handle."""
         process.start()
@@ -434,13 +445,7 @@ class WorkerView:
 
 
 def _describe(handle: Any) -> WorkerInfo:
-    child, worker = handle.child, handle.worker
-    if child is None or child.waiting:
-        return WorkerInfo(handle.name, "", "", None, "waiting", 0)
-    if handle.leaving:
-        state = "leaving"
-    elif worker is None:
-        state = "starting"
-    else:
-        state = "busy" if worker.queue or worker.leased else "idle"
+    child, state = handle.child, handle.state
+    if state == "waiting":
+        return WorkerInfo(handle.name, "", "", None, state, 0)
     return WorkerInfo(handle.name, child.host, child.node, child.pid, state, handle.tasks)

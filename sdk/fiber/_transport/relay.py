@@ -267,7 +267,7 @@ def run(environment: Mapping[str, str]) -> int:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: loop.call_soon(loop.stop))
     loop.register(wake, lambda: os.read(wake, 64))
-    _print(f"listens for agents at port {relay.agents_port}")
+    _print(f"listens at port {relay.agents_port} for agents, {relay.master_port} for the master")
     loop.run()
     relay.close()
     return 0

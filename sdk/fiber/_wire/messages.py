@@ -19,7 +19,7 @@ from fiber._wire.memory_files import BytesLike
 from fiber._wire.packet import ALIGNMENT, INLINE_LIMIT
 from fiber.errors import FiberError
 
-PROTOCOL = 3
+PROTOCOL = 4
 """Version of the frames of this module and of all that they carry: the messages of ``work.py`` and
 ``hub.protocol``, and pickles of Fiber's classes.  Raise it when one of these changes."""
 
@@ -199,6 +199,20 @@ class Exited(NamedTuple):
         return _redacted(self)
 
 
+class ShownStack(NamedTuple):
+    """Agent to master: the Python stacks of a child that got the signal for it."""
+
+    child: int
+    text: str
+
+    def encode(self) -> bytes:
+        """Return the frame."""
+        return _NUMBER.pack(PROTOCOL, _STACK, self.child) + _utf8(self.text)
+
+    def __repr__(self) -> str:
+        return _redacted(self)
+
+
 class ChildOutput(NamedTuple):
     """Agent to master: text that the child wrote to stdout or stderr."""
 
@@ -305,6 +319,7 @@ LinkMessage: TypeAlias = (
     | Recall
     | Recalled
     | Exited
+    | ShownStack
     | ChildOutput
     | TunnelOpen
     | TunnelData
@@ -346,7 +361,7 @@ def decode(frame: BytesLike) -> LinkMessage:
 
 _START, _STARTED, _SIGNAL, _DELIVER, _FROM_CHILD, _RECALL, _RECALLED, _EXITED = range(1, 9)
 _OUTPUT, _TUNNEL_OPEN, _TUNNEL_DATA, _TUNNEL_CLOSE, _SHUTDOWN = 9, 11, 12, 13, 14
-_BLOB, _FORGET, _LACKING, _MEMORY, _LEAVE = 15, 16, 17, 18, 19
+_BLOB, _FORGET, _LACKING, _MEMORY, _LEAVE, _STACK = range(15, 21)
 
 _HEAD = struct.Struct("<BB")
 _NUMBER = struct.Struct("<BBQ")
@@ -510,6 +525,11 @@ def _read_exited(view: memoryview) -> Exited:
     )
 
 
+def _read_stack(view: memoryview) -> ShownStack:
+    _, _, child = _NUMBER.unpack_from(view)
+    return ShownStack(child, _text(view[_NUMBER.size :]))
+
+
 def _read_output(view: memoryview) -> ChildOutput:
     return ChildOutput(_NUMBER.unpack_from(view)[2], _text(view[_NUMBER.size :]))
 
@@ -562,6 +582,7 @@ _READERS: dict[int, Callable[[memoryview], LinkMessage]] = {
     _RECALL: _read_recall,
     _RECALLED: _read_recalled,
     _EXITED: _read_exited,
+    _STACK: _read_stack,
     _OUTPUT: _read_output,
     _TUNNEL_OPEN: _read_tunnel_open,
     _TUNNEL_DATA: _read_tunnel_data,

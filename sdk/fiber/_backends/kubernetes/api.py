@@ -425,6 +425,12 @@ class Login(NamedTuple):
     def in_cluster(self) -> bool:
         return self.kubeconfig is None
 
+    @staticmethod
+    def is_configured() -> bool:
+        """Return whether there is a kubeconfig, or an account of this pod."""
+        names = (os.environ.get("KUBECONFIG") or os.path.expanduser(_KUBECONFIG)).split(os.pathsep)
+        return "KUBERNETES_SERVICE_HOST" in os.environ or any(map(os.path.exists, names))
+
     @classmethod
     def find(cls, context: str | None) -> Login:
         """Find a kubeconfig, or the account of this pod."""

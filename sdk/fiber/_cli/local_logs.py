@@ -1,0 +1,69 @@
+"""Output of a program of this machine, if it goes to a file."""
+
+from __future__ import annotations
+
+import os
+import stat
+import time
+
+from fiber._cli import streams
+from fiber._cli.failures import USAGE, CommandError
+from fiber._cli.local import LocalProgram
+
+_PIECE = 1 << 16
+_PAUSE = 0.2
+"""Seconds between two looks at a file that is followed."""
+
+
+def show(program: LocalProgram, *, worker: str | None, follow: bool, since: str | None) -> None:
+    """Show the file that a program's standard output goes to."""
+    for option, given in (("--worker", worker), ("--since", since)):
+        if given is not None:
+            raise CommandError(
+                f"{option} is for programs in pods",
+                f"{program.name!r} runs on this machine, and its workers share its output",
+                f"leave out {option}",
+                USAGE,
+            )
+    with open(_file(program), "rb") as log:
+        process = os.pidfd_open(program.pid) if follow else -1
+        try:
+            _copy(log.fileno(), process)
+        finally:
+            if process >= 0:
+                os.close(process)
+
+
+def _file(program: LocalProgram) -> str:
+    link = f"/proc/{program.pid}/fd/1"
+    try:
+        place, mode = os.readlink(link), os.stat(link).st_mode
+    except OSError:
+        place, mode = "nothing", 0
+    if not stat.S_ISREG(mode):
+        raise CommandError(
+            f"there is no log of {program.name!r}",
+            f"the program runs on this machine, and its output goes to {place}",
+            "see it there, or start the program with its output in a file: "
+            "python train.py >train.log 2>&1",
+        )
+    return link
+
+
+def _copy(log: int, process: int) -> None:
+    """Copy a file's bytes and, until ``process`` ends, those that are added."""
+    while True:
+        ended = process < 0 or _has_ended(process)
+        while data := os.read(log, _PIECE):
+            streams.write(data)
+        if ended:
+            return
+        time.sleep(_PAUSE)
+
+
+def _has_ended(process: int) -> bool:
+    import select
+
+    poller = select.poll()
+    poller.register(process, select.POLLIN)
+    return bool(poller.poll(0))

@@ -1,0 +1,74 @@
+"""Client of the monitors of this machine's programs."""
+
+from __future__ import annotations
+
+import glob
+import json
+import os
+import socket
+import tempfile
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from fiber._hub.directory import remove_directory
+from fiber._monitor.server import PEER, SOCKET
+
+PATIENCE = 10.0
+"""Seconds that a program may take for a part of its answer."""
+
+
+class NoAnswer(Exception):
+    """Error: the program does not answer, or has ended; the message says which."""
+
+
+def sockets(parent: str | None = None) -> list[str]:
+    """Return the sockets of this user's programs, whose directories are in ``parent``.
+
+    None means the folders for temporary files.
+    """
+    parents = [parent] if parent else sorted({tempfile.gettempdir(), "/tmp"})
+    found = [
+        path for each in parents for path in glob.glob(f"{glob.escape(each)}/fiber-*/{SOCKET}")
+    ]
+    return sorted(path for path in found if _is_mine(path))
+
+
+def ask(
+    path: str, request: Mapping[str, Any], patience: float = PATIENCE
+) -> Iterator[dict[str, Any]]:
+    """Yield the lines of a program's answer; NoAnswer."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as sock:
+        sock.settimeout(patience)
+        try:
+            sock.connect(path)
+            sock.sendall(json.dumps(request).encode() + b"\n")
+            with sock.makefile("rb") as stream:
+                for line in stream:
+                    yield json.loads(line)
+        except ConnectionRefusedError as error:
+            remove_directory(os.path.dirname(path))  # the program was killed
+            raise NoAnswer("the program has ended") from error
+        except TimeoutError as error:
+            raise NoAnswer(f"the program does not answer within {patience:.0f} s") from error
+        except (OSError, ValueError) as error:
+            raise NoAnswer(f"the program has ended: {error}") from error
+
+
+def pid_of(path: str) -> int | None:
+    """Return the pid of the program that listens at a socket; None if it has ended."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK) as sock:
+        try:
+            sock.connect(path)
+        except OSError:
+            return None
+        credentials = sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, PEER.size)
+        return int(PEER.unpack(credentials)[0])
+
+
+def _is_mine(path: str) -> bool:
+    """Return whether only this user can have made the socket."""
+    try:
+        found = os.lstat(os.path.dirname(path))
+    except OSError:
+        return False
+    return found.st_uid == os.geteuid() and found.st_mode & 0o077 == 0

@@ -1,0 +1,106 @@
+"""Server of the monitor: a socket in the program's private directory.
+
+A client sends a request, one line of JSON.  The answer is lines of JSON, until the server closes
+the connection.  The loop accepts connections, and a thread answers each of them.  So the monitor
+costs nothing while there is no client.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import socket
+import struct
+import threading
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from fiber import _logs
+from fiber._transport.loop import Loop
+
+SOCKET = "monitor"
+"""Name of the socket in the program's directory."""
+
+PEER = struct.Struct("iII")
+"""Credentials of the other end of a socket: pid, uid, gid."""
+
+_MOST_CLIENTS = 32
+_LONGEST = 1 << 16
+"""Bytes of a request."""
+_PATIENCE = 10.0
+"""Seconds that a client may take to send its request, and to take a part of the answer."""
+
+Answer = Callable[[dict[str, Any]], Iterable[dict[str, Any]]]
+
+
+class MonitorServer:
+    """Server of one program.  ``answer`` runs on a thread for each client."""
+
+    def __init__(self, loop: Loop, directory: str, answer: Answer) -> None:
+        """Listen in ``directory``; OSError if that is not possible.  Any thread."""
+        self._loop = loop
+        self._answer = answer
+        self._clients: set[socket.socket] = set()
+        self._path = os.path.join(directory, SOCKET)
+        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
+        try:
+            self._listener.bind(self._path)
+            self._listener.listen(_MOST_CLIENTS)
+        except BaseException:
+            self._listener.close()
+            raise
+        loop.call_soon(loop.register, self._listener.fileno(), self._accept)
+
+    def close(self) -> None:
+        """Refuse clients, and end the answers.  Runs after the end of the loop."""
+        self._listener.close()
+        with contextlib.suppress(OSError):
+            os.unlink(self._path)
+        for client in list(self._clients):
+            with contextlib.suppress(OSError):
+                client.shutdown(socket.SHUT_RDWR)
+
+    def forget(self) -> None:
+        """Close this process's copies of the sockets, after a fork."""
+        self._listener.close()
+        for client in list(self._clients):
+            client.close()
+
+    def _accept(self) -> None:
+        try:
+            client, _ = self._listener.accept()
+        except OSError:  # the client is gone, or no descriptor is free
+            return
+        _, uid, _ = PEER.unpack(client.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, PEER.size))
+        if uid not in (os.geteuid(), 0) or len(self._clients) >= _MOST_CLIENTS:
+            client.close()
+            return
+        self._clients.add(client)
+        try:
+            threading.Thread(
+                target=self._serve, args=(client,), name="fiber-monitor", daemon=True
+            ).start()
+        except RuntimeError as error:  # the system has no room for a thread
+            _logs.debug("no thread for a client of the monitor: %s", error)
+            self._clients.discard(client)
+            client.close()
+
+    def _serve(self, client: socket.socket) -> None:
+        try:
+            client.settimeout(_PATIENCE)
+            with client, contextlib.suppress(OSError):
+                for line in self._lines(client):
+                    client.sendall(json.dumps(line).encode() + b"\n")
+        finally:
+            self._clients.discard(client)
+
+    def _lines(self, client: socket.socket) -> Iterable[dict[str, Any]]:
+        try:
+            with client.makefile("rb") as stream:
+                request = json.loads(stream.readline(_LONGEST))
+            yield from self._answer(request)
+        except OSError:
+            raise
+        except Exception as error:  # the client shows it
+            yield {"error": f"{type(error).__name__}: {error}"}

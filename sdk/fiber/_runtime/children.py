@@ -1,0 +1,105 @@
+"""Children of this program: those that were started and have not ended."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Protocol
+
+from fiber._agent.interface import ChildHandle, ExitReport
+from fiber._agent.last_words import SHOW
+from fiber._hub.handles import GrantSet
+from fiber._wire.packet import Message
+
+
+class ChildOwner(Protocol):
+    """Owner of a child: starts it, and takes the agent's reports about it."""
+
+    @property
+    def state(self) -> str:
+        """State of the child in one word, as in ``WorkerInfo``."""
+
+    def begin(self, child: ChildHandle) -> None:
+        """Keep the child's handle, and start it.  The loop calls this first of all."""
+
+    def started(self, pid: int) -> None:
+        """Take note that the child runs as process ``pid``."""
+
+    def received(self, message: Message) -> None:
+        """Take a packet that the child sent on its task channel."""
+
+    def recalled(self, seqs: list[int]) -> None:
+        """Take the answer to ``recall``: the packets that the child will never read."""
+
+    def draining(self) -> None:
+        """Take note that the child's host is about to end: send the child no more tasks."""
+
+    def exited(self, report: ExitReport) -> None:
+        """Take note that the child ended or could not be started.  Called once, and last."""
+
+
+class Child:
+    """A child of this program.  It passes on the agent's reports to the child's owner.
+
+    Runs on the loop thread.
+    """
+
+    def __init__(self, children: Children, owner: ChildOwner, grants: GrantSet) -> None:
+        self.handle: ChildHandle | None = None
+        self.owner = owner
+        self.started = owner.started
+        self.received = owner.received
+        self.recalled = owner.recalled
+        self.draining = owner.draining
+        self._children = children
+        self._grants = grants
+        self._askers: list[Callable[[str], None]] = []
+
+    def begin(self, handle: ChildHandle) -> None:
+        """Start the child."""
+        self.handle = handle
+        self._children.add(self)
+        self.owner.begin(handle)
+
+    def exited(self, report: ExitReport) -> None:
+        """Release unused grants, and forget the child."""
+        if self._grants:
+            self._grants.release()
+        self._children.remove(self)
+        self.showed_stack(f"It has ended: {report.describe()}.")
+        self.owner.exited(report)
+
+    def ask_for_stack(self, then: Callable[[str], None]) -> None:
+        """Call ``then`` with the Python stacks of the child's threads, or why there are none."""
+        assert self.handle is not None
+        if self.handle.waiting:
+            then("It waits for a host.")
+            return
+        self._askers.append(then)
+        self.handle.signal(SHOW)
+
+    def showed_stack(self, text: str) -> None:
+        """Pass on the stacks to those that asked for them."""
+        askers, self._askers = self._askers, []
+        for then in askers:
+            then(text)
+
+
+class Children:
+    """Children that were started and have not ended.  Runs on the loop thread."""
+
+    def __init__(self) -> None:
+        self._children: dict[Child, None] = {}
+
+    def add(self, child: Child) -> None:
+        """Note that a child is being started."""
+        self._children[child] = None
+
+    def remove(self, child: Child) -> None:
+        """Forget a child that has ended."""
+        self._children.pop(child, None)
+
+    def __len__(self) -> int:
+        return len(self._children)
+
+    def __iter__(self) -> Iterator[Child]:
+        return iter(list(self._children))

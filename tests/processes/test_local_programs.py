@@ -1,0 +1,159 @@
+"""The command on programs of this machine: ``fiber ps``, ``logs``, ``stop`` and ``stack``."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from census import wait_until
+from faults.program import Program
+from patience import PATIENCE
+from unit.pool_command_rig import run
+
+_SCRIPT = """
+import time, fiber
+
+def hang():
+    time.sleep(3600)
+
+if __name__ == "__main__":
+    fiber.Process(target=hang, name="Simulator", daemon=True).start()
+    print("begun", flush=True)
+    hang()
+"""
+
+
+@pytest.fixture(autouse=True)
+def _only_this_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No cluster is configured, and no other test's programs are seen."""
+    monkeypatch.setenv("KUBECONFIG", str(tmp_path / "none"))
+    monkeypatch.setenv("FIBER_RUNTIME_DIRECTORY", str(tmp_path))
+
+
+@pytest.fixture
+def start() -> Iterator[Callable[..., Program]]:
+    """Starts a program that hangs in a process."""
+    started: list[Program] = []
+
+    def start(**options: Any) -> Program:
+        started.append(Program(_SCRIPT, **options))
+        return started[-1]
+
+    yield start
+    for program in started:
+        program.close()
+
+
+@pytest.fixture
+def program(start: Callable[..., Program]) -> Program:
+    made = start()
+    assert made.line() == "begun"
+    return made
+
+
+def name_of(program: Program) -> str:
+    return f"program-{program.pid}"
+
+
+def test_a_program_is_listed(program: Program) -> None:
+    (row,) = json.loads(run("ps", "--output", "json").out)
+    facts = ("name", "state", "workers", "pid", "job")
+    assert [row[key] for key in facts] == [name_of(program), "running", 1, program.pid, False]
+    assert row["command"].endswith(str(program.script))
+    assert row["created"].endswith("Z")
+    assert name_of(program) in run("ps").out
+
+
+def test_no_program_is_listed_without_an_error() -> None:
+    outcome = run("ps")
+    assert outcome == (0, "", "no program runs on this machine\n")
+
+
+@pytest.mark.parametrize("command", ["logs", "stop", "stack"])
+def test_an_unknown_program_is_named_with_the_nearest_one(program: Program, command: str) -> None:
+    outcome = run(command, f"progam-{program.pid}")
+    assert outcome.status == 3
+    assert f"there is no program 'progam-{program.pid}'" in outcome.err
+    assert f"did you mean {name_of(program)!r}?" in outcome.err
+
+
+def test_a_stopped_program_is_listed_as_silent(
+    program: Program, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fiber._cli.local._PATIENCE", 0.05)
+    os.kill(program.pid, signal.SIGSTOP)
+    try:
+        (row,) = json.loads(run("ps", "--output", "json").out)
+        assert (row["state"], row["pid"]) == ("silent", program.pid)
+    finally:
+        os.kill(program.pid, signal.SIGCONT)
+
+
+def test_a_program_is_asked_to_end(program: Program) -> None:
+    name = name_of(program)
+    assert run("stop", name) == (0, f"asked the program {name!r} to end\n", "")
+    assert program.process.wait(PATIENCE) == -signal.SIGTERM
+
+
+def test_a_program_is_killed_by_its_pid(program: Program) -> None:
+    outcome = run("stop", str(program.pid), "--now")
+    assert outcome == (0, f"killed the program {name_of(program)!r}\n", "")
+    assert program.process.wait(PATIENCE) == -signal.SIGKILL
+
+
+def test_the_stacks_of_a_program_and_its_process_are_shown(program: Program) -> None:
+    def shows_both() -> bool:
+        return run("stack", name_of(program)).out.count(" in hang\n") == 2
+
+    assert wait_until(shows_both, PATIENCE)
+    out = run("stack", name_of(program)).out
+    assert out.startswith(f"program (pid {program.pid})\nThread MainThread")
+    assert "\nSimulator (pid " in out
+
+
+def test_the_stack_of_one_worker_is_shown(program: Program) -> None:
+    outcome = run("stack", name_of(program), "--worker", "Simulator", "--output", "json")
+    (stack,) = json.loads(outcome.out)
+    assert (stack["name"], stack["state"]) == ("Simulator", "running")
+
+
+def test_an_unknown_worker_is_named_with_the_nearest_one(program: Program) -> None:
+    outcome = run("stack", name_of(program), "--worker", "Simulatr")
+    assert outcome.status == 3
+    assert "there is no worker 'Simulatr'" in outcome.err
+    assert "did you mean 'Simulator'?" in outcome.err
+
+
+def test_the_log_of_a_program_is_the_file_that_it_writes_to(
+    start: Callable[..., Program], tmp_path: Path
+) -> None:
+    with (tmp_path / "log").open("wb") as log:
+        program = start(stdout=log)
+    assert wait_until(lambda: "begun" in (tmp_path / "log").read_text(), PATIENCE)
+    name = name_of(program)
+    following = subprocess.Popen(
+        [sys.executable, "-m", "fiber._cli.main", "logs", name, "--follow"], stdout=subprocess.PIPE
+    )
+    assert following.stdout is not None
+    assert following.stdout.readline() == b"begun\n"
+    outcome = run("logs", name, "--since", "5m")
+    program.process.kill()
+    assert following.communicate(timeout=PATIENCE) == (b"", None)
+    assert following.returncode == 0
+    assert outcome.status == 2
+    assert "--since is for programs in pods" in outcome.err
+
+
+def test_a_program_whose_output_is_no_file_has_no_log(program: Program) -> None:
+    outcome = run("logs", name_of(program))
+    assert outcome.status == 1
+    assert f"there is no log of {name_of(program)!r}" in outcome.err
+    assert "its output goes to pipe:" in outcome.err
