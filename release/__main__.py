@@ -11,7 +11,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from fiber._backends.kubernetes.published import OPERATOR
+from fiber._backends.kubernetes.published import OPERATOR, chart_version
 from release import ROOT, ReleaseError, changelog, images, packages, trial, versions
 
 DRY_REGISTRY = "registry.example/fiber"
@@ -51,7 +51,7 @@ def _notes(version: str, registry: str, tag: str | None) -> str:
         news = changelog.section(ROOT, version)
     if tag is not None:
         versions.check_tag(tag, version)
-    chart = f"oci://{registry}/charts/{OPERATOR} --version {versions.chart_version(version)}"
+    chart = f"oci://{registry}/charts/{OPERATOR} --version {chart_version(version)}"
     head = (
         "```console\n"
         f"$ pip install 'fiberpool[kubernetes]=={version}'\n"
@@ -88,7 +88,7 @@ def agree(
 
     ``named`` are the images that wheel and chart name, ``published`` those that are pushed.
     """
-    wanted = versions.chart_version(version), version
+    wanted = chart_version(version), version
     if wheel != version or chart != wanted:
         raise ReleaseError(
             f"the versions differ: the checkout has {version}, the wheel {wheel}, the chart "

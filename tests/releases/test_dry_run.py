@@ -149,7 +149,7 @@ def sdist(tmp_path: Path) -> Path:
     folder = tmp_path / "pypi"
     folder.mkdir()
     (tmp_path / "fiberpool-1.2.0").mkdir()
-    command = ["tar", "czf", folder / "fiberpool-1.2.0.tar.gz", "fiberpool-1.2.0"]
+    command: list[str | Path] = ["tar", "czf", folder / "fiberpool-1.2.0.tar.gz", "fiberpool-1.2.0"]
     subprocess.run(command, cwd=tmp_path, check=True)
     return folder
 
