@@ -109,5 +109,5 @@ def test_a_cluster_without_the_operator_has_programs(cluster: Cluster) -> None:
 def test_no_program(cluster: Cluster) -> None:
     outcome = run("ps")
     assert (outcome.status, outcome.out) == (0, "")
-    assert "no program runs in the namespace 'lab'" in outcome.err
+    assert "no program runs on this machine or in the namespace 'lab'" in outcome.err
     assert rows() == []
