@@ -63,6 +63,10 @@ def hang_in_python() -> NoReturn:
         pass
 
 
+def hang_with(_: object) -> NoReturn:
+    hang_in_python()
+
+
 def hang_in_native_code() -> None:
     """Hold the GIL, so that no thread and no Python signal handler runs."""
     start_beside()

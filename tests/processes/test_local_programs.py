@@ -125,6 +125,19 @@ def test_the_stack_of_one_worker_is_shown(program: Program) -> None:
     assert (stack["name"], stack["state"]) == ("Simulator", "running")
 
 
+def test_the_state_of_the_only_program_is_shown(program: Program) -> None:
+    outcome = run("top", "--once")
+    assert outcome.status == 0, outcome.err
+    assert outcome.out.startswith(name_of(program))
+    assert "RUNNING" in outcome.out
+
+
+def test_a_state_without_a_name_needs_one_program() -> None:
+    outcome = run("top", "--once")
+    assert outcome.status == 1
+    assert "no programs run on this machine" in outcome.err
+
+
 def test_an_unknown_worker_is_named_with_the_nearest_one(program: Program) -> None:
     outcome = run("stack", name_of(program), "--worker", "Simulatr")
     assert outcome.status == 3
