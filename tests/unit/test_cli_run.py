@@ -214,6 +214,16 @@ def test_a_mistake_is_told_before_anything_is_made(site: Site, words: list[str],
     assert site.nodes.jobs() == []
 
 
+def test_a_program_without_an_image_is_refused(site: Site) -> None:
+    site.write("train.py", "")
+    del site.environment["FIBER_IMAGE"]
+    what, why, do = refused(site.fiber("run", "train.py"), 2)
+    assert what == "there is no image for workers"
+    assert "development build" in why
+    assert "--image" in do
+    assert site.nodes.jobs() == []
+
+
 def test_a_remedy_names_what_was_meant(site: Site) -> None:
     site.write("sub/train.py", "")
     site.write("train.py", "")

@@ -11,8 +11,13 @@ import sys
 from typing import Any
 
 from fiber import config, resources
-from fiber._backends.kubernetes.template import PodShape, names_secret, pod_template
-from fiber._cli.failures import USAGE, CommandError
+from fiber._backends.kubernetes.template import (
+    ImageMissing,
+    PodShape,
+    names_secret,
+    pod_template,
+)
+from fiber._cli.failures import USAGE, CommandError, no_image
 from fiber._cli.run_source import FOLDER, Source
 from fiber.errors import ConfigError
 from fiber_api import names
@@ -101,6 +106,8 @@ def _worker_template(options: dict[str, Any], settings: config.Config) -> Body:
         if options["image"]:
             shape = dataclasses.replace(shape, image=options["image"])
         return pod_template(shape, None, "", sys.executable)
+    except ImageMissing as error:
+        raise no_image() from error
     except (ConfigError, TypeError, ValueError) as error:
         raise CommandError(
             "the program's pod cannot be made",
