@@ -200,6 +200,8 @@ def test_an_account_without_rights_is_not_left_behind(site: Site) -> None:
         (["--env", "=x", "train.py"], "'=x' names no variable"),
         (["--env", "API_TOKEN=x", "train.py"], "the variable 'API_TOKEN' looks like a secret"),
         (["--volume", "data", "train.py"], "'data' names no volume"),
+        (["--attach", "", "train.py"], "--attach starts no program"),
+        (["--attach", ""], "'' cannot be the name of a program"),
         (["--attach", "mine", "train.py"], "--attach starts no program"),
         (["--attach", "mine", "--detach"], "--attach starts no program"),
         (["--local", "--detach", "train.py"], "--local runs the program in this place"),
@@ -258,6 +260,18 @@ def test_errors_of_the_command_have_the_status_125(site: Site, fault: Fault, wha
     outcome = site.fiber("run", "--name", "mine", "train.py")
     assert outcome.status == 125
     assert what in outcome.err
+
+
+@pytest.mark.parametrize(("status", "advice"), [(401, "log in"), (403, "--service-account")])
+def test_the_remedy_is_that_of_the_fault(site: Site, status: int, advice: str) -> None:
+    """A login that has ended is no lack of rights."""
+    site.write("train.py", "")
+    for verb in ("get", "create"):
+        kind = "serviceaccounts" if verb == "get" else "rolebindings"
+        if verb == "get" and status == 403:
+            continue  # accounts need not be readable
+        site.server.api.faults.append(Fault(verb, kind, status, "Refused", times=9))
+    assert advice in refused(site.fiber("run", "train.py"), 125)[2]
 
 
 def test_a_program_that_is_not_there_is_an_error_of_the_command(site: Site) -> None:

@@ -114,7 +114,7 @@ def explained(doing: str) -> Iterator[None]:
     except Transient as error:
         raise CommandError(
             f"cannot {doing}",
-            f"the API server does not answer: {error.message}",
+            f"the API server does not answer: {' '.join(error.message.split())}",
             "check the network and the kubeconfig (`kubectl cluster-info`), then try again",
             NO_ANSWER,
         ) from error

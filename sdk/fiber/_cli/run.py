@@ -11,7 +11,7 @@ from typing import Any
 import click
 
 from fiber._cli import following
-from fiber._cli.failures import USAGE, CommandError, ProgramEnded, explained
+from fiber._cli.failures import NO_RIGHT, USAGE, CommandError, ProgramEnded, explained
 from fiber._cli.programs import find_job
 from fiber._cli.run_job import job_of, name_of, variables_of
 from fiber._cli.run_source import command_of, program_file, source_of
@@ -84,7 +84,7 @@ def command(namespace: str | None, context: str | None, **options: Any) -> int:
     try:
         if options["local"]:
             _run_here(options)
-        if options["attach"]:
+        if options["attach"] is not None:
             session = connect(context, namespace)
             return following.attach(session, find_job(session, options["attach"]))
         return _run(context, namespace, options)
@@ -102,7 +102,7 @@ def command(namespace: str | None, context: str | None, **options: Any) -> int:
 
 def _check(options: dict[str, Any]) -> None:
     starts = options["module"] or options["words"] not in ((), ("--",))
-    if options["attach"]:
+    if options["attach"] is not None:
         for given, what in (
             (starts, "a script is named"),
             (options["local"], "--local is given"),
@@ -182,6 +182,8 @@ def _ensure_account(session: Session) -> str:
             with contextlib.suppress(Conflict):
                 session.api.create(ACCOUNTS.path(namespace), {"metadata": metadata})
     except CommandError as error:
+        if error.status != NO_RIGHT:
+            raise
         error.remedy = (
             "name an account that has the role fiber-user with --service-account, or ask an "
             f"administrator: `kubectl create serviceaccount {name} -n {namespace}` and `kubectl "
