@@ -1,40 +1,25 @@
 """Launchers of programs as processes of this machine, and requests to them."""
 
-
 from __future__ import annotations
 
-import contextlib
-import ctypes
-import gzip
 import http.client
 import io
 import json
-import os
-import signal
-import socket
-import subprocess
 import sys
 import tarfile
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
-
 from fakes.program_nodes import Launched, kill
-from faults.program import wait_for
 from fiber.launcher import (
-    ALIVE,
-    DROPPED,
     EXIT,
     FAILURE,
     FOLLOWS,
     LAYOUT,
-    NUMBER,
     RECORD,
     STATUS,
     STDERR,
     STDOUT,
-    Output,
 )
 from patience import PATIENCE
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import gzip
-import http.client
 import io
 import json
 import os
@@ -15,12 +14,11 @@ import subprocess
 import sys
 import tarfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from fakes.program_nodes import Launched, kill
 from faults.program import wait_for
 from fiber.launcher import (
     ALIVE,
@@ -37,7 +35,8 @@ from fiber.launcher import (
     Output,
 )
 from patience import PATIENCE
-from unit.launcher_rig import Pod, Records, Site, archive, status_in, text
+from unit.launcher_rig import Records, Site, archive, status_in, text
+
 
 @pytest.fixture
 def site(tmp_path: Path) -> Iterator[Site]:

@@ -29,6 +29,9 @@ _FILES_WITHIN = 600
 _KEPT = 3600
 """Seconds that a program that has ended is kept, with its log."""
 
+_GROUP = 65532
+"""Group of the user of Fiber's images."""
+
 _LONGEST_COMMAND = 4096
 """Characters of the command line that are shown."""
 
@@ -201,4 +204,20 @@ def _mount(spec: Body, container: Body, volumes: tuple[str, ...]) -> None:
             {"name": volume, "persistentVolumeClaim": {"claimName": claim}}
         )
         mount = {"name": volume, "mountPath": path, "readOnly": mode == "ro"}
-        container.setdefault("volumeMounts", []).append(mount)
+        mounts = container.setdefault("volumeMounts", [])
+        if any(other.get("mountPath") == path for other in mounts):
+            raise CommandError(
+                f"two volumes are mounted at {path}",
+                f"{word!r} and another --volume, or the template, name this path",
+                "choose another path",
+                USAGE,
+            )
+        mounts.append(mount)
+        if mode != "ro":
+            _let_write(spec.setdefault("securityContext", {}))
+
+
+def _let_write(context: Body) -> None:
+    """Let the user of Fiber's images write to the volumes, unless the template says who may."""
+    if "fsGroup" not in context:
+        context |= {"fsGroup": _GROUP, "fsGroupChangePolicy": "OnRootMismatch"}
