@@ -72,6 +72,17 @@ def test_a_program_is_listed(program: Program) -> None:
     assert name_of(program) in run("ps").out
 
 
+def test_a_program_is_listed_although_the_cluster_does_not_answer(
+    program: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "config").write_text("nonsense")
+    monkeypatch.setenv("KUBECONFIG", str(tmp_path / "config"))
+    outcome = run("ps")
+    assert outcome.status == 4
+    assert name_of(program) in outcome.out
+    assert "cannot connect to a cluster" in outcome.err
+
+
 def test_no_program_is_listed_without_an_error() -> None:
     outcome = run("ps")
     assert outcome == (0, "", "no program runs on this machine\n")
