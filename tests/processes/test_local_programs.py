@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ import pytest
 
 from census import wait_until
 from faults.program import Program
+from fiber._monitor import client
 from patience import PATIENCE
 from unit.pool_command_rig import run
 
@@ -158,3 +160,38 @@ def test_a_program_whose_output_is_no_file_has_no_log(program: Program) -> None:
     assert outcome.status == 1
     assert f"there is no log of {name_of(program)!r}" in outcome.err
     assert "its output goes to pipe:" in outcome.err
+
+
+def test_programs_are_asked_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    both = threading.Barrier(2, timeout=PATIENCE)
+
+    def silent(path: str) -> None:
+        both.wait()
+
+    monkeypatch.setattr(client, "sockets", lambda _: ["first", "second"])
+    monkeypatch.setattr("fiber._cli.local._program", silent)
+    assert run("ps").err == "no program runs on this machine\n"
+
+
+def test_a_worker_of_one_of_a_pods_programs_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    stack = {"name": "Simulator", "pid": 7, "text": "here"}
+    lines = [{"unknown": "Simulator", "names": ["Other"]}, {"stack": stack}]
+    monkeypatch.setattr("fiber._cli.stack._answer", lambda *_: iter(lines))
+    assert run("stack", "train", "--worker", "Simulator") == (0, "Simulator (pid 7)\nhere\n\n", "")
+
+
+def test_one_program_that_does_not_answer_hides_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    lines = [{"error": "silent"}, {"stack": {"name": "program", "text": "here"}}]
+    monkeypatch.setattr("fiber._cli.stack._answer", lambda *_: iter(lines))
+    outcome = run("stack", "train")
+    assert "here" in outcome.out
+    assert "silent" in outcome.err
+
+
+def test_no_cluster_is_asked_without_the_package_for_it(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "config").touch()
+    monkeypatch.setenv("KUBECONFIG", str(tmp_path / "config"))
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert run("ps") == (0, "", "no program runs on this machine\n")
