@@ -9,7 +9,7 @@ BIN := $(VENV)/bin
 FAST_TESTS := tests/contract tests/simulation tests/unit
 SIDE_BY_SIDE := -q -n $(shell echo $$(($$(nproc) * 3 / 2))) --dist loadfile
 FAST := $(BIN)/python -m pytest $(SIDE_BY_SIDE) $(FAST_TESTS)
-WHOLE_PROGRAMS := tests/chart tests/examples tests/faults tests/processes
+WHOLE_PROGRAMS := tests/chart tests/examples tests/faults tests/processes tests/releases
 # Tests that depend most on the interpreter: pickling, starting and ending processes, threads, locks.
 ESSENTIAL_TESTS := $(patsubst %,tests/processes/test_%.py,connection context exit_functions futures \
 	loopback pool process queues synchronize) $(patsubst %,tests/unit/test_%.py,reduction \
@@ -22,7 +22,7 @@ unexport PYTHONDONTWRITEBYTECODE
 CLUSTER := PYTHONPATH=tests $(BIN)/python -m cluster
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-fast test-pythons test-long e2e lint bench bench-operator bench-kubernetes conformance conformance-original crds images cluster cluster-down clean
+.PHONY: help demo test test-fast test-pythons test-long e2e lint bench bench-operator bench-kubernetes conformance conformance-original crds images cluster cluster-down release release-prepare release-dry-run clean
 
 help:
 	@sed -n 's/^## //p' $(MAKEFILE_LIST)
@@ -136,6 +136,19 @@ cluster: $(VENV)/.made
 ## make cluster-down  stop that cluster and delete its files
 cluster-down: $(VENV)/.made
 	$(CLUSTER) down
+
+## make release-prepare VERSION=1.2.0  write the version and the changelog (docs/releasing.md)
+release-prepare: $(VENV)/.with-dev
+	$(BIN)/python -m release prepare "$(VERSION)"
+
+# The workflow of a release runs this for its tag.
+release: $(VENV)/.with-dev
+	$(BIN)/python -m release build --tag "$(TAG)" --registry "$(REGISTRY)"
+
+## make release-dry-run  everything of a release but publishing, into build/release
+release-dry-run: $(VENV)/.with-dev
+	PATH="$$PATH:$$(PYTHONPATH=tests $(BIN)/python -c 'from cluster import places; print(places.programs())')" \
+		$(BIN)/python -m release build
 
 ## make clean         remove the environments and the files of the tools
 clean:

@@ -24,6 +24,8 @@ KUBERNETES = "1.34.0"
 Values = Mapping[str, Any]
 Manifest = dict[str, Any]
 DEFAULTS: Values = {}
+IMAGE: Values = {"repository": "fiber-operator"}
+"""Value `image` that the chart of a checkout needs, unless a test gives others."""
 
 
 class Refused(Exception):
@@ -75,7 +77,7 @@ class Helm:
         usual = ["--namespace", NAMESPACE, "--kube-version", KUBERNETES]
         folders = {f"HELM_{name}_HOME": str(self.home) for name in ("CACHE", "CONFIG", "DATA")}
         with tempfile.NamedTemporaryFile("w", suffix=".json", dir=self.home) as file:
-            json.dump(values, file)
+            json.dump({**values, "image": {**IMAGE, **values.get("image", {})}}, file)
             file.flush()
             done = subprocess.run(
                 [self.program, *arguments, *usual, "--values", file.name],

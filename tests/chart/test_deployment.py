@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 import fiber
-from chart.helm import Helm, Manifest, is_hook, named
+from chart.helm import Helm, Manifest, Refused, is_hook, named
 from chart.test_scope import environment
 from fiber_api.names import check_pool_name
 from fiber_operator.settings import OperatorSettings
@@ -128,6 +128,16 @@ def test_the_version_is_the_projects(helm: Helm) -> None:
 )
 def test_images_by_tag_and_by_digest(helm: Helm, image: dict[str, str], expected: str) -> None:
     assert images(helm.render({"image": image})) == {expected}
+
+
+@pytest.mark.parametrize("image", [{}, {"digest": "sha256:" + "0" * 64}], ids=["tag", "digest"])
+def test_a_chart_without_an_image_says_what_to_set(helm: Helm, image: dict[str, str]) -> None:
+    with pytest.raises(Refused) as refused:
+        helm.render({"image": {"repository": "", **image}})
+    said = str(refused.value)
+    assert "image.repository is empty" in said
+    assert "development build" in said
+    assert "set image.repository=REGISTRY/fiber-operator" in said
 
 
 def test_the_pod_of_helm_test_has_the_placement_of_the_operator(helm: Helm) -> None:

@@ -36,6 +36,24 @@ def test_the_manifest_is_for_a_namespace_that_is_watched(
     assert f"kubectl --namespace {namespace} get fiberpools --watch" in helm.notes(values)
 
 
+@pytest.mark.parametrize(
+    ("values", "image"),
+    [
+        (
+            {"image": {"repository": "r.example:5000/a/fiber-operator"}},
+            "r.example:5000/a/fiber-worker",
+        ),
+        ({"image": {"repository": "r.example/op"}}, "r.example/fiber-worker"),
+        ({"workerImage": {"repository": "mine"}}, "mine"),
+    ],
+)
+def test_the_workers_image_is_beside_the_operators(
+    helm: Helm, values: dict[str, Any], image: str
+) -> None:
+    (worker,) = pasted(helm.notes(values))["spec"]["template"]["spec"]["containers"]
+    assert worker["image"] == f"{image}:{fiber.__version__}"
+
+
 def test_the_commands_name_the_installed_objects(helm: Helm) -> None:
     notes = helm.notes()
     name = named(helm.render(), "Deployment")["metadata"]["name"]

@@ -63,6 +63,7 @@ def test_a_person_who_runs_programs_gets_jobs_and_logs_beside_them(roles: list[M
     for _, resource, verb in allowed(named(roles, "ClusterRole", "fiber-runner")):
         rights.setdefault(resource, set()).add(verb)
     assert rights == {
+        "events": {"list"},
         "jobs": {"create", "delete", "get", "list"},
         "pods/log": {"get"},
         "serviceaccounts": {"get"},

@@ -46,14 +46,15 @@ class Builder(ABC):
         archive.parent.mkdir(parents=True, exist_ok=True)
         unfinished = archive.with_suffix(".unfinished")
         unfinished.unlink(missing_ok=True)
-        self._save(reference, unfinished)
+        self.save(reference, unfinished)
         unfinished.rename(archive)
 
     @abstractmethod
     def _build(self, reference: str, context: Path, options: list[str]) -> None: ...
 
     @abstractmethod
-    def _save(self, reference: str, archive: Path) -> None: ...
+    def save(self, reference: str, archive: Path) -> None:
+        """Write an image that this builder has to an archive."""
 
     @abstractmethod
     def remove(self, reference: str) -> None:
@@ -66,7 +67,7 @@ class Docker(Builder):
         command = ("docker", "build", "--quiet", "--tag", reference, *options)
         output(*command, cwd=context, env=environment)
 
-    def _save(self, reference: str, archive: Path) -> None:
+    def save(self, reference: str, archive: Path) -> None:
         output("docker", "save", "--output", archive, reference)
 
     def remove(self, reference: str) -> None:
@@ -99,7 +100,7 @@ class Buildah(Builder):
         environment = {**os.environ, "TMPDIR": "/var/tmp"}
         output(*BUILDAH, *command, "--tag", reference, *options, cwd=context, env=environment)
 
-    def _save(self, reference: str, archive: Path) -> None:
+    def save(self, reference: str, archive: Path) -> None:
         target = f"docker-archive:{archive}:{reference}"
         buildah("push", "--quiet", f"localhost/{reference}", target)
 

@@ -36,6 +36,10 @@ class Containerd:
         """Give an image that is there another name, which may have been another image's."""
         output(*self._ctr("images", "tag", "--force", reference, other))
 
+    def remove(self, reference: str) -> None:
+        """Remove an image, if it is there."""
+        output(*self._ctr("images", "rm", "--sync", reference))
+
     def kill(self, container: str) -> None:
         """SIGKILL to the first process of a container: the others of its pid namespace follow."""
         output(*self._ctr("tasks", "kill", "--signal", "SIGKILL", container))

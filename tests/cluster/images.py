@@ -17,7 +17,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -216,6 +216,22 @@ def load(archive: Path, reference: str | None = None) -> None:
     with ThreadPoolExecutor() as pool:
         for _ in pool.map(lambda node: node.load(archive), wanting):
             pass
+
+
+@contextmanager
+def saved(reference: str) -> Iterator[Path]:
+    """Yield an archive of an image that the builder has."""
+    builder, _ = builder_and_base()
+    with tempfile.TemporaryDirectory(prefix="fiber-image-", dir="/var/tmp") as folder:
+        archive = Path(folder, "image.tar")
+        builder.save(reference, archive)
+        yield archive
+
+
+def unload(reference: str) -> None:
+    """Remove an image from every node."""
+    for index in places.nodes():
+        Containerd(index).remove(full_name(reference))
 
 
 def full_name(reference: str) -> str:

@@ -107,6 +107,10 @@ class Cluster:
         """Have one more image on the nodes, of those that few tests need; its reference."""
         raise NotImplementedError
 
+    def having(self, reference: str) -> AbstractContextManager[None]:
+        """Have an image of this machine's builder on the nodes meanwhile."""
+        self._skip("load an image into the nodes")
+
     def laptop(self) -> AbstractContextManager[Laptop]:
         """Have a machine that reaches the API server, and that no pod reaches."""
         self._skip("put a laptop behind NAT")
@@ -169,6 +173,13 @@ class Own(Cluster):
     def bring(self, image: Image) -> str:
         return images.bring(image)
 
+    @contextlib.contextmanager
+    def having(self, reference: str) -> Iterator[None]:
+        with images.saved(reference) as archive:
+            images.load(archive, reference)
+        yield
+        images.unload(reference)
+
     def laptop(self) -> AbstractContextManager[Laptop]:
         return laptop.plugged_in()
 
@@ -194,7 +205,7 @@ class Kind(Cluster):
             self.outside = _gateway()
             self.images = images.build_images()
             for image in images.IMAGES:
-                self._load(image)
+                self._load(image.archive)
                 self._tag(self.images[image.name], image.released(places.CHECKOUT))
         except BaseException:
             self.close()
@@ -202,8 +213,17 @@ class Kind(Cluster):
 
     def bring(self, image: Image) -> str:
         reference = images.build(image)
-        self._load(image)
+        self._load(image.archive)
         return reference
+
+    @contextlib.contextmanager
+    def having(self, reference: str) -> Iterator[None]:
+        with images.saved(reference) as archive:
+            self._load(archive)
+        yield
+        for node in self._nodes():
+            remove = ("images", "rm", "--sync", images.full_name(reference))
+            self._inside(node, "ctr", "--namespace", "k8s.io", *remove)
 
     @classmethod
     def make(cls, name: str = "fiber-e2e") -> Kind:
@@ -247,14 +267,17 @@ class Kind(Cluster):
         kill = ("tasks", "kill", "--signal", "SIGKILL", container_id)
         self._inside(node, "ctr", "--namespace", "k8s.io", *kill)
 
-    def _load(self, image: Image) -> None:
-        output("kind", "load", "image-archive", image.archive, "--name", self._name)
+    def _load(self, archive: Path) -> None:
+        output("kind", "load", "image-archive", archive, "--name", self._name)
 
     def _tag(self, reference: str, other: str) -> None:
         names = map(images.full_name, (reference, other))
         tag = ("ctr", "--namespace", "k8s.io", "images", "tag", "--force", *names)
-        for node in output("kind", "get", "nodes", "--name", self._name).split():
+        for node in self._nodes():
             self._inside(node, *tag)
+
+    def _nodes(self) -> list[str]:
+        return output("kind", "get", "nodes", "--name", self._name).split()
 
     @staticmethod
     def _inside(node: str, *command: str) -> None:

@@ -24,6 +24,10 @@ from fiber_api import names
 pytestmark = pytest.mark.timeout(300, func_only=True)
 
 STRANGERS = 1000
+PODS = 60
+"""Workers, as many as two nodes on a small machine start within minutes."""
+RELAY_BUDGET = 150 << 20
+"""Bytes of a relay with 200 agents, and so with fewer."""
 
 
 @pytest.fixture
@@ -145,6 +149,39 @@ def test_a_map_survives_a_fault_unchanged(
     runs = [line for line in program.lines if line.endswith(" runs")]
     assert len(runs) == len({line.rpartition("]")[2] for line in runs})
     leaves_nothing(program, seconds=90)
+
+
+@pytest.mark.long
+@pytest.mark.timeout(600, func_only=True)
+def test_one_relay_carries_the_agents_of_many_pods(
+    programs: Programs, laptop: Laptop, scene: Scene
+) -> None:
+    settings = {"relay": "always", "cpu_request": 0, "memory_request": 0}
+    program = programs.on_laptop(
+        "mapping.py", "--workers", PODS, "--tasks", 6000, "--seconds", 0.2, **settings
+    )
+    (relay,) = scene.wait("a relay is ready", lambda: relays(scene), 60)
+
+    def workers() -> bool:
+        pods = scene.now["pods"].values()
+        ours = [pod for pod in pods if names.LABEL_RELAY not in pod["metadata"]["labels"]]
+        return len([pod for pod in ours if is_ready(pod)]) == PODS
+
+    scene.wait(f"{PODS} agents are connected", workers, 300)
+    status = ("--namespace", scene.namespace, "exec", relay["metadata"]["name"], "--")
+    used = resident(scene.kube.kubectl(*status, "cat", "/proc/1/status"))
+    done = program.says("done", seconds=240)
+    assert done["total"] == sum(number * number for number in range(6000))
+    assert len(done["hosts"]) == PODS
+    assert used <= RELAY_BUDGET
+    program.ends()
+    leaves_nothing(program, seconds=120)
+
+
+def resident(status: str) -> int:
+    """Return the resident memory in bytes that ``/proc/PID/status`` has."""
+    (line,) = [line for line in status.splitlines() if line.startswith("VmRSS:")]
+    return int(line.split()[1]) << 10
 
 
 def test_two_programs_each_have_a_relay(programs: Programs, laptop: Laptop, scene: Scene) -> None:

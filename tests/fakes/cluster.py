@@ -9,6 +9,8 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
+import pytest
+
 from fakes.agent_kubelet import AgentKubelet
 from fakes.store import Body
 from fakes.world import World, a_world
@@ -56,9 +58,16 @@ class FakeCluster:
         asyncio.run_coroutine_threadsafe(until, self._loop).result(2 * PATIENCE)
 
 
+IMAGE = "registry.example/worker:1"
+"""Image of workers, which nothing pulls."""
+
+
 @contextlib.contextmanager
 def fake_cluster(**settings: Any) -> Iterator[FakeCluster]:
-    """Make a new cluster with only an operator, which has these settings."""
+    """Make a new cluster with only an operator, which has these settings.
+
+    Programs name an image for their workers, as those of a development build must.
+    """
     started: concurrent.futures.Future[FakeCluster] = concurrent.futures.Future()
     end = asyncio.Event()
 
@@ -74,7 +83,9 @@ def fake_cluster(**settings: Any) -> Iterator[FakeCluster]:
     thread.start()
     try:
         cluster = started.result(PATIENCE)
-        yield cluster
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("FIBER_IMAGE", IMAGE)
+            yield cluster
     finally:
         cluster.do(end.set)
         thread.join()

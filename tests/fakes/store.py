@@ -32,6 +32,7 @@ KINDS = {
     "deployments": ("apps/v1", "Deployment"),
     "poddisruptionbudgets": ("policy/v1", "PodDisruptionBudget"),
     "jobs": ("batch/v1", "Job"),
+    "roles": ("rbac.authorization.k8s.io/v1", "Role"),
     "rolebindings": ("rbac.authorization.k8s.io/v1", "RoleBinding"),
     "leases": ("coordination.k8s.io/v1", "Lease"),
     "customresourcedefinitions": ("apiextensions.k8s.io/v1", "CustomResourceDefinition"),

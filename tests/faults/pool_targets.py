@@ -108,6 +108,10 @@ def show_stacks(times: int) -> None:
         time.sleep(0)
 
 
+def hang_with(_: object) -> NoReturn:
+    hang_in_python()
+
+
 def hang_in_native_code() -> None:
     """Hold the GIL, so that no thread and no Python signal handler runs."""
     start_beside()

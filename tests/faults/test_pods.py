@@ -25,7 +25,7 @@ from faults.runtime import running
 from fiber._backends.kubernetes.api import Api
 from fiber._backends.kubernetes.provisioner import _local_address
 from fiber._runtime import state
-from fiber.errors import FiberPoolError, MemberLost, WorkerDied
+from fiber.errors import ConfigError, FiberPoolError, MemberLost, WorkerDied
 from fiber_api import names
 from patience import PATIENCE
 from ports import reserved_port
@@ -146,6 +146,18 @@ def test_a_pool_is_pods_that_come_with_the_work_and_go_with_the_program(
         assert sorted(info.host for info in pool.workers()) == pods_of(cluster)
         assert {info.node for info in pool.workers()} == {"node-1"}
         assert sum(info.tasks for info in pool.workers()) == 100
+
+
+def test_a_program_without_an_image_is_told_before_any_pod_is_made(
+    cluster: FakeCluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("FIBER_IMAGE")
+    with (
+        running(backend="kubernetes"),
+        fiber.Pool(2) as pool,
+        pytest.raises(ConfigError, match=r"no image for workers: .*development build.*FIBER_IMAGE"),
+    ):
+        pool.map(square, range(10))
 
 
 def test_pods_share_memory_with_the_program_and_each_other(cluster: FakeCluster) -> None:

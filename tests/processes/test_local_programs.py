@@ -127,6 +127,19 @@ def test_the_stack_of_one_worker_is_shown(program: Program) -> None:
     assert (stack["name"], stack["state"]) == ("Simulator", "running")
 
 
+def test_the_state_of_the_only_program_is_shown(program: Program) -> None:
+    outcome = run("top", "--once")
+    assert outcome.status == 0, outcome.err
+    assert outcome.out.startswith(name_of(program))
+    assert "RUNNING" in outcome.out
+
+
+def test_a_state_without_a_name_needs_one_program() -> None:
+    outcome = run("top", "--once")
+    assert outcome.status == 1
+    assert "no programs run on this machine" in outcome.err
+
+
 def test_an_unknown_worker_is_named_with_the_nearest_one(program: Program) -> None:
     outcome = run("stack", name_of(program), "--worker", "Simulatr")
     assert outcome.status == 3
@@ -176,13 +189,13 @@ def test_programs_are_asked_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_worker_of_one_of_a_pods_programs_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     stack = {"name": "Simulator", "pid": 7, "text": "here"}
     lines = [{"unknown": "Simulator", "names": ["Other"]}, {"stack": stack}]
-    monkeypatch.setattr("fiber._cli.stack._answer", lambda *_: iter(lines))
+    monkeypatch.setattr("fiber._cli.stack.answer_of", lambda *_: iter(lines))
     assert run("stack", "train", "--worker", "Simulator") == (0, "Simulator (pid 7)\nhere\n\n", "")
 
 
 def test_one_program_that_does_not_answer_hides_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
     lines = [{"error": "silent"}, {"stack": {"name": "program", "text": "here"}}]
-    monkeypatch.setattr("fiber._cli.stack._answer", lambda *_: iter(lines))
+    monkeypatch.setattr("fiber._cli.stack.answer_of", lambda *_: iter(lines))
     outcome = run("stack", "train")
     assert "here" in outcome.out
     assert "silent" in outcome.err

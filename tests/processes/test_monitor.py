@@ -152,3 +152,48 @@ def test_an_unknown_worker_is_said_to_be_unknown(pool: Pool) -> None:
 def test_an_unknown_question_is_an_error(pool: Pool) -> None:
     (line,) = ask(ask="weather")
     assert "no answer to 'weather'" in line["error"]
+
+
+def state() -> dict[str, list[dict[str, Any]]]:
+    found: dict[str, list[dict[str, Any]]] = {"pool": [], "child": [], "death": []}
+    for line in ask(ask="state"):
+        for kind, facts in line.items():
+            found[kind].append(facts)
+    return found
+
+
+def test_the_state_of_a_pool_counts_its_tasks(pool: Pool) -> None:
+    assert pool.map(abs, range(10)) == list(range(10))
+    assert pool.apply(abs, (-1,)) == 1
+    pool.map_async(tasks.hang_with, range(100), chunksize=1)
+    assert wait_until(lambda: bool(state()["pool"][0]["slowest"]), PATIENCE)
+    (facts,) = state()["pool"]
+    (worker,) = pool.workers()
+    assert facts["workers"] == {"busy": 1}
+    assert facts["done"] == 11
+    assert facts["held"] + facts["waiting"] == 100
+    (task,) = facts["slowest"]
+    assert task["task"] == "task 0 of hang_with()"
+    assert (task["worker"], task["host"]) == (worker.name, worker.host)
+    assert task["seconds"] >= 0
+
+
+def test_tasks_of_workers_that_are_gone_still_count(pool: Pool) -> None:
+    for number in range(3):
+        pool.apply(abs, (number,))
+    (worker,) = pool.workers()
+    assert worker.pid is not None
+    os.kill(worker.pid, signal.SIGKILL)
+    assert wait_until(lambda: pool.apply(os.getpid) != worker.pid, PATIENCE)
+    assert state()["pool"][0]["done"] >= 4
+    death = state()["death"][-1]
+    assert (death["name"], death["pid"]) == (worker.name, worker.pid)
+    assert "SIGKILL" in death["reason"]
+
+
+def test_a_pool_that_has_ended_is_no_longer_seen(pool: Pool) -> None:
+    pool.apply(abs, (-1,))
+    deaths = len(state()["death"])
+    pool.close()
+    pool.join()
+    assert (state()["pool"], state()["child"], len(state()["death"])) == ([], [], deaths)

@@ -41,6 +41,7 @@ class Stage:
         self.loop = world.loop
         self.config = SimpleNamespace(start_timeout=1.0)
         self.elastic = False
+        self.pools: set[object] = set()
         self.rng = random.Random(f"{world.schedule.seed} stage")
         self.world = world
         self._started = 0

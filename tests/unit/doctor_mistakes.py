@@ -13,6 +13,7 @@ import pytest
 
 from fakes.doctor_cluster import RESOURCES, DoctorCluster
 from fakes.kubernetes_api import Fault
+from fiber._backends.kubernetes import published
 from fiber._backends.kubernetes.problems import AgentRoute, PoolName, failure, unreachable
 from fiber._cli.doctor_attempt import TrialCourse, mismatch_in
 from fiber._cli.doctor_trial_verdicts import Program
@@ -47,6 +48,10 @@ class DoctorRig:
     def attempt(self, *_: Any) -> TrialCourse:
         self.trials += 1
         return self.course
+
+    def unpublish(self) -> None:
+        """Make this Fiber a development build."""
+        self.patch.setattr(published, "REGISTRY", "")
 
     def setenv(self, name: str, value: object) -> None:
         self.patch.setenv(f"FIBER_{name}", str(value))
@@ -268,6 +273,7 @@ MISTAKES = [
     Mistake(
         "default limit", _range(default={"memory": "32Mi"}), "quota", "LimitRange", "memory_request"
     ),
+    Mistake("image not set", DoctorRig.unpublish, "image", "no image for workers", "FIBER_IMAGE"),
     Mistake("no room", _no_room, "nodes", "no node has room", "add nodes"),
     Mistake("taint", _taint, "nodes", "no node has room", "tolerations"),
     Mistake(

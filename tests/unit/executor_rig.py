@@ -199,6 +199,7 @@ class Rig:
             loop=self.loop,
             start=self._start,
             elastic=False,
+            pools=set(),
             look_at_program=lambda: None,
             config=SimpleNamespace(start_timeout=1.0),
         )

@@ -97,6 +97,7 @@ def cluster(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Cluster]:
     """Yield a cluster, that of the kubeconfig; the working directory is ``folder``."""
     with served() as server:
         monkeypatch.setenv("KUBECONFIG", str(kubeconfig(folder, server.api.url)))
+        monkeypatch.setenv("FIBER_IMAGE", "worker:1")
         monkeypatch.setenv("FIBER_RUNTIME_DIRECTORY", str(folder))  # not those of other tests
         monkeypatch.chdir(folder)
         yield Cluster(server)

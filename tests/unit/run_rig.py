@@ -43,6 +43,7 @@ class Site:
             **os.environ,
             "KUBECONFIG": str(kubeconfig(folder.parent, server.api.url)),
             "COLUMNS": "200",
+            "FIBER_IMAGE": "worker:1",
             "FIBER_RUNTIME_DIRECTORY": str(folder),  # not where other tests have their programs
         }
         self._commands: list[subprocess.Popen[bytes]] = []

@@ -15,6 +15,7 @@ from fakes.doctor_cluster import ROOT, DoctorCluster
 from fakes.rights import FIBER_USER
 from fakes.served import served
 from fiber import config
+from fiber._backends.kubernetes import published
 from fiber._backends.kubernetes.template import fiber_pool_body
 from fiber._cli import doctor
 from fiber._cli.doctor_attempt import LONGEST_START, settings_of
@@ -38,6 +39,7 @@ def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[DoctorRig]:
     with served() as server:
         monkeypatch.setenv("KUBECONFIG", str(kubeconfig(tmp_path, server.api.url)))
         monkeypatch.delenv("FIBER_IMAGE", raising=False)  # that of `make cluster`
+        monkeypatch.setattr(published, "REGISTRY", "registry.example/fiber")
         monkeypatch.chdir(tmp_path)
         made = DoctorRig(DoctorCluster(server, NAMESPACE), tmp_path, monkeypatch, server.api.url)
         monkeypatch.setattr(doctor, "attempt", made.attempt)
@@ -281,7 +283,17 @@ def test_the_source_of_the_image_is_said(
     force(rig)
     (line,) = (v["what"] for v in verdicts("--no-trial") if v["check"] == "image")
     assert source in line
-    assert line.startswith("fiber-worker:" if source == "the default" else "mine:1 ")
+    default = f"{published.worker_image()} "
+    assert line.startswith(default if source == "the default" else "mine:1 ")
+
+
+def test_a_program_with_a_warm_pool_needs_no_image(rig: DoctorRig) -> None:
+    rig.unpublish()
+    rig.cluster.add(names.PLURAL, pool_body("warm"))
+    rig.setenv("POOL", "warm")
+    outcome = run("doctor")
+    assert outcome.status == 0, outcome.out
+    assert "image: that of its pods (from the FiberPool 'warm')" in outcome.out
 
 
 def test_warm_pools_and_their_programs_are_listed(rig: DoctorRig) -> None:

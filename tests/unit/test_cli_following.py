@@ -19,6 +19,7 @@ from fakes.kubernetes_api import Call, Fault
 from fakes.program_nodes import kill
 from fiber_api import names
 from patience import PATIENCE
+from unit.kubernetes_rig import NAMESPACE
 from unit.pool_command_rig import Outcome
 from unit.run_rig import WAITS, Site, interrupt, read_line, run_site
 from unit.test_cli_run import refused
@@ -203,6 +204,50 @@ def test_a_job_that_makes_no_pod(site: Site, condition: dict[str, str], what: st
     site.set_job(conditions=[{"status": "True", **condition}])
     site.remove("pods", site.pod())
     assert refused(site.end(command), 125)[0] == what
+
+
+def test_why_a_job_has_no_pod_yet_is_told_once(site: Site) -> None:
+    site.nodes.auto = False
+    site.write("train.py", "")
+    command = site.spawn("run", "--name", "mine", "train.py")
+    site.nodes.wait(site.nodes.pods)
+    site.remove("pods", site.pod())
+    for number in "12":
+        site.server.do(
+            site.server.store.create,
+            "events",
+            NAMESPACE,
+            {
+                "metadata": {"name": f"mine.{number}"},
+                "involvedObject": {"kind": "Job", "name": "mine"},
+                "reason": "FailedCreate",
+                "message": f'pods "mine-abcd{number}" is forbidden:\nexceeded quota',
+            },
+        )
+    assert command.stderr is not None
+    line = read_line(command.stderr, b"no pod yet")
+    while b"quota" not in line:
+        line = read_line(command.stderr, b"no pod yet")
+    assert b"no pod yet: pods mine is forbidden: exceeded quota\n" in line
+    interrupt(command)
+    assert "no pod yet" not in site.end(command).err
+
+
+def test_an_image_that_cannot_be_is_an_error(site: Site) -> None:
+    site.nodes.auto = False
+    site.write("train.py", "")
+    command = site.spawn("run", "--name", "mine", "train.py")
+    site.nodes.wait(site.nodes.pods)
+    waiting = {"waiting": {"reason": "InvalidImageName", "message": "BAD"}}
+    status = {
+        "phase": "Pending",
+        "containerStatuses": [{"name": names.PROGRAM_CONTAINER, "state": waiting}],
+    }
+    site.server.do(site.server.store.set_status, "pods", NAMESPACE, site.pod(), status)
+    what, why, _ = refused(site.end(command), 125)
+    assert what == "the program 'mine' cannot start"
+    assert why == "its pod waits: InvalidImageName: BAD"
+    assert site.nodes.jobs() == []
 
 
 # ---- attach and detach

@@ -121,8 +121,25 @@ def test_names_and_times_that_are_wrong(site: Site) -> None:
     assert refused(site.fiber("logs", "mine", "--worker", "pool-2"), 3)[2].endswith("'pool-1'?")
     for since in ("5", "m", "0s", "-5m", "5w", "99999999999999999999s"):
         assert refused(site.fiber("logs", "mine", f"--since={since}"), 2)[2] == "--since 5m"
+    site.remove("pods", "pool-1")
+    without = refused(site.fiber("logs", "mine", "--worker", "pool-1"), 3)
+    assert without[1] == "the program 'mine' has no workers now"
     site.remove("pods", pod)
     assert refused(site.fiber("logs", "mine"), 1)[0] == "the program 'mine' has no pod"
+
+
+def test_an_empty_log_is_told(site: Site) -> None:
+    run_program(site)
+    pod = site.pod()
+    site.nodes.logs.append([])
+    outcome = site.fiber("logs", "mine")
+    assert (outcome.status, outcome.out) == (0, "")
+    assert "the log is empty" in outcome.err
+    add_worker(site, pod, "pool-1")
+    site.nodes.logs.append([])
+    outcome = site.fiber("logs", "mine", "--worker", "pool-1")
+    assert (outcome.status, outcome.out) == (0, "")
+    assert "what its tasks print is in the program's" in outcome.err
 
 
 def test_a_log_that_the_cluster_does_not_give(site: Site) -> None:

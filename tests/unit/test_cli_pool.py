@@ -271,6 +271,16 @@ def test_warm_makes_a_pool_as_a_program_would(
     assert container["command"] == ["python", "-m", "fiber.agent"]
 
 
+def test_warm_needs_an_image(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("FIBER_IMAGE")
+    outcome = run("pool", "warm", "big", "--workers", "3")
+    what, why, do = refused(outcome, USAGE)
+    assert what == "there is no image for workers"
+    assert "development build" in why
+    assert "--image" in do
+    assert cluster.names() == ["warm"]
+
+
 def test_warm_changes_what_is_given_alone(cluster: Cluster) -> None:
     sidecar = {"name": "logs", "image": "logs:1"}
     worker = {"name": "worker", "image": "worker:1", "env": [{"name": "A", "value": "1"}]}

@@ -90,6 +90,42 @@ def test_the_state_of_a_program_that_ended(cluster: Cluster, kind: str, state: s
     assert rows()[0]["state"] == state
 
 
+@pytest.mark.parametrize(
+    ("state", "word"),
+    [
+        ({"running": {}}, "running"),
+        ({"terminated": {"exitCode": 0}}, "succeeded"),
+        ({"terminated": {"exitCode": 3}}, "failed"),
+        ({"waiting": {"reason": "ContainerCreating"}}, "starting"),
+    ],
+)
+def test_the_pod_knows_the_state_before_the_job(cluster: Cluster, state: Body, word: str) -> None:
+    add_program(cluster, "train-1")
+    containers = [{"name": names.PROGRAM_CONTAINER, "state": state}]
+    status = {"phase": "Running", "containerStatuses": containers}
+    store = cluster.server.store
+    cluster.server.do(store.set_status, "pods", NAMESPACE, "train-1-pod0", status)
+    assert rows()[0]["state"] == word
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["ps", "--namespace", "../../x"],
+        ["stop", ".."],
+        ["logs", "a/b"],
+        ["pool", "show", ".."],
+        ["pool", "scale", "a?b", "1"],
+    ],
+    ids=" ".join,
+)
+def test_a_name_that_would_change_the_path_is_refused(cluster: Cluster, words: list[str]) -> None:
+    outcome = run(*words)
+    assert outcome.status == 2
+    assert "cannot be the name of a" in outcome.err
+    assert cluster.server.api.calls == []
+
+
 def test_each_list_is_asked_for_once(cluster: Cluster) -> None:
     add_program(cluster, "train-1", ready=1)
     outcome = run("ps")
@@ -109,5 +145,5 @@ def test_a_cluster_without_the_operator_has_programs(cluster: Cluster) -> None:
 def test_no_program(cluster: Cluster) -> None:
     outcome = run("ps")
     assert (outcome.status, outcome.out) == (0, "")
-    assert "no program runs in the namespace 'lab'" in outcome.err
+    assert "no program runs on this machine or in the namespace 'lab'" in outcome.err
     assert rows() == []

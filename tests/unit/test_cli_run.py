@@ -137,6 +137,7 @@ def test_the_job_asks_for_what_the_options_name(site: Site) -> None:
     assert site.variables().items() >= {("HERE", "there"), ("EMPTY", ""), ("FIBER_IMAGE", "mine:1")}
     assert container["envFrom"] == [{"secretRef": {"name": "keys"}}]
     assert container["volumeMounts"][0]["readOnly"] is True
+    assert "fsGroup" not in pod["securityContext"]
     assert site.server.objects("serviceaccounts") == []
 
 
@@ -155,6 +156,35 @@ def test_a_configured_template_keeps_its_variables_and_containers(site: Site) ->
     named = [each["name"] for each in site.container()["env"]]
     assert len(named) == len(set(named))
     assert [each["secretRef"]["name"] for each in site.container()["envFrom"]] == ["theirs", "mine"]
+
+
+def test_the_program_may_write_to_its_volumes(site: Site) -> None:
+    site.write("train.py", "")
+    outcome = site.fiber("run", "--volume", "data:/data", "--volume", "more:/more:ro", "train.py")
+    assert outcome == Outcome(0, "", "")
+    context = site.job()["spec"]["template"]["spec"]["securityContext"]
+    assert (context["fsGroup"], context["fsGroupChangePolicy"]) == (65532, "OnRootMismatch")
+
+
+def test_the_group_of_the_template_stays(site: Site) -> None:
+    site.write("train.py", "")
+    site.write("template.yaml", "spec: {securityContext: {fsGroup: 7}}")
+    site.environment["FIBER_TEMPLATE"] = "template.yaml"
+    assert site.fiber("run", "--volume", "data:/data", "train.py") == Outcome(0, "", "")
+    assert site.job()["spec"]["template"]["spec"]["securityContext"]["fsGroup"] == 7
+
+
+@pytest.mark.parametrize(("known", "kind"), [(True, "Role"), (False, "ClusterRole")])
+def test_the_account_gets_the_role_that_the_chart_has_made(
+    site: Site, known: bool, kind: str
+) -> None:
+    site.write("train.py", "")
+    if known:
+        role = {"metadata": {"name": "fiber-user"}, "rules": []}
+        site.server.do(site.server.store.create, "roles", NAMESPACE, role)
+    assert site.fiber("run", "train.py").status == 0
+    (binding,) = site.server.objects("rolebindings")
+    assert binding["roleRef"]["kind"] == kind
 
 
 def test_the_account_of_programs_is_made_once_with_its_rights(site: Site) -> None:
@@ -200,6 +230,9 @@ def test_an_account_without_rights_is_not_left_behind(site: Site) -> None:
         (["--env", "=x", "train.py"], "'=x' names no variable"),
         (["--env", "API_TOKEN=x", "train.py"], "the variable 'API_TOKEN' looks like a secret"),
         (["--volume", "data", "train.py"], "'data' names no volume"),
+        (["--volume", "a:/d", "--volume", "b:/d", "train.py"], "two volumes are mounted at /d"),
+        (["--attach", "", "train.py"], "--attach starts no program"),
+        (["--attach", ""], "'' cannot be the name of a program"),
         (["--attach", "mine", "train.py"], "--attach starts no program"),
         (["--attach", "mine", "--detach"], "--attach starts no program"),
         (["--local", "--detach", "train.py"], "--local runs the program in this place"),
@@ -211,6 +244,16 @@ def test_a_mistake_is_told_before_anything_is_made(site: Site, words: list[str],
     site.write("sub/train.py", "")
     site.write("package/__init__.py", "")
     assert refused(site.fiber("run", *words), 2)[0] == what
+    assert site.nodes.jobs() == []
+
+
+def test_a_program_without_an_image_is_refused(site: Site) -> None:
+    site.write("train.py", "")
+    del site.environment["FIBER_IMAGE"]
+    what, why, do = refused(site.fiber("run", "train.py"), 2)
+    assert what == "there is no image for workers"
+    assert "development build" in why
+    assert "--image" in do
     assert site.nodes.jobs() == []
 
 
@@ -248,6 +291,18 @@ def test_errors_of_the_command_have_the_status_125(site: Site, fault: Fault, wha
     outcome = site.fiber("run", "--name", "mine", "train.py")
     assert outcome.status == 125
     assert what in outcome.err
+
+
+@pytest.mark.parametrize(("status", "advice"), [(401, "log in"), (403, "--service-account")])
+def test_the_remedy_is_that_of_the_fault(site: Site, status: int, advice: str) -> None:
+    """A login that has ended is no lack of rights."""
+    site.write("train.py", "")
+    for verb in ("get", "create"):
+        kind = "serviceaccounts" if verb == "get" else "rolebindings"
+        if verb == "get" and status == 403:
+            continue  # accounts need not be readable
+        site.server.api.faults.append(Fault(verb, kind, status, "Refused", times=9))
+    assert advice in refused(site.fiber("run", "train.py"), 125)[2]
 
 
 def test_a_program_that_is_not_there_is_an_error_of_the_command(site: Site) -> None:

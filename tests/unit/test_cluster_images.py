@@ -59,7 +59,7 @@ class Notebook(Builder):
         files = (path for path in context.rglob("*") if path.is_file())
         self.seen = {str(path.relative_to(context)) for path in files}
 
-    def _save(self, reference: str, archive: Path) -> None:
+    def save(self, reference: str, archive: Path) -> None:
         archive.write_text(reference)
 
     def remove(self, reference: str) -> None:

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import copy
-import re
-from pathlib import Path
 from typing import Any
 
 import pytest
 
-import fiber
-from cluster import images, places
+from fiber._backends.kubernetes import published
+from fiber._backends.kubernetes.published import worker_image
 from fiber._backends.kubernetes.template import (
-    WORKER_IMAGE,
+    ImageMissing,
     PodShape,
     fiber_pool_body,
     own_container,
@@ -92,6 +90,11 @@ POD: dict[str, Any] = {
 }
 
 
+@pytest.fixture(autouse=True)
+def _release(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(published, "REGISTRY", "registry.example/fiber")
+
+
 def worker_of(template: dict[str, Any]) -> dict[str, Any]:
     (worker,) = template["spec"]["containers"]
     assert worker["name"] == names.WORKER_CONTAINER
@@ -105,16 +108,23 @@ def like(shape: PodShape | None = None, pod: dict[str, Any] = POD) -> dict[str, 
 class TestElsewhere:
     def test_a_pod_is_this_versions_worker(self) -> None:
         template = pod_template(PodShape(), None, "", PYTHON)
-        assert template == {
-            "spec": {"containers": [{"name": "worker", "image": WORKER_IMAGE, "command": AGENT}]}
-        }
+        worker = {"name": "worker", "image": worker_image(), "command": AGENT}
+        assert template == {"spec": {"containers": [worker]}}
 
-    def test_the_worker_image_has_the_same_name_in_chart_build_and_sdk(self) -> None:
-        assert images.WORKER.released(places.CHECKOUT) == WORKER_IMAGE
-        values = Path(places.CHECKOUT, "charts/fiber-operator/values.yaml").read_text()
-        found = re.search(r"^workerImage:\n(?:  #.*\n)*  repository: (\S+)$", values, re.MULTILINE)
-        assert found is not None
-        assert f"{found[1]}:{fiber.__version__}" == WORKER_IMAGE
+    def test_a_template_can_have_the_image(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(published, "REGISTRY", "")
+        worker = {"name": "worker", "image": "es:1"}
+        shape = PodShape.of(Config(template={"spec": {"containers": [worker]}}))
+        assert worker_of(pod_template(shape, None, "", PYTHON))["image"] == "es:1"
+
+    def test_a_development_build_needs_an_image(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(published, "REGISTRY", "")
+        with pytest.raises(ImageMissing, match=r"no image for workers: .*set image.*FIBER_IMAGE"):
+            pod_template(PodShape(), None, "", PYTHON)
+
+    def test_a_program_in_a_pod_has_its_own_image(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(published, "REGISTRY", "")
+        assert worker_of(like())["image"] == POD["spec"]["containers"][1]["image"]
 
     def test_the_configured_image_takes_its_place(self) -> None:
         template = pod_template(PodShape(image="es:1"), None, "", PYTHON)

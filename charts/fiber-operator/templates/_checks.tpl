@@ -4,6 +4,9 @@ contradictions are reported at once: what, why, and what to do.
 */}}
 {{- define "fiber-operator.check" -}}
 {{- $faults := list -}}
+{{- if empty .Values.image.repository -}}
+{{- fail (printf "image.repository is empty: this chart, %s, is that of a development build, and no registry has its images. Install the chart of a release. Or build the images with `make images`, push them to a registry that the nodes reach, and set image.repository=REGISTRY/fiber-operator. On the cluster of `make cluster`, whose nodes have them, set image.repository=fiber-operator." .Chart.Version) -}}
+{{- end -}}
 {{- with .Values -}}
 
 {{- if and (eq .scope "cluster") .namespaces -}}

@@ -70,6 +70,13 @@ meet, the chart's own win, so that no object carries a label twice.
 {{- toYaml (mergeOverwrite dict (default dict $extra) (default dict $root.Values.commonLabels) $labels) -}}
 {{- end -}}
 
+{{/* The image of workers: its repository is beside the operator's by default. */}}
+{{- define "fiber-operator.workerImage" -}}
+{{- $folder := trimSuffix (base .Values.image.repository) .Values.image.repository -}}
+{{- $repository := default (printf "%sfiber-worker" $folder) .Values.workerImage.repository -}}
+{{- include "fiber-operator.image" (list (set (deepCopy .Values.workerImage) "repository" $repository) .Chart) -}}
+{{- end -}}
+
 {{/* Called with the image's values and the chart: a digest wins over a tag, a tag over appVersion. */}}
 {{- define "fiber-operator.image" -}}
 {{- $image := index . 0 -}}

@@ -16,7 +16,7 @@ spec:
       {{- end }}
       containers:
         - name: worker
-          image: {{ include "fiber-operator.image" (list $root.Values.workerImage $root.Chart) }}
+          image: {{ include "fiber-operator.workerImage" $root }}
           resources:
             requests:
               cpu: 50m

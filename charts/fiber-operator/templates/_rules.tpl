@@ -110,6 +110,10 @@ runner:
   - apiGroups: [""]
     resources: [pods/log]
     verbs: [get]
+  # Why a Job has no pod: a quota, for example.
+  - apiGroups: [""]
+    resources: [events]
+    verbs: [list]
 viewer:
   - apiGroups: [fiber.dev]
     resources: [fiberpools]

@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import fiber
+from fiber._backends.kubernetes.published import install_command
+from fiber._backends.kubernetes.template import ImageMissing
 from fiber._cli.display import counted
 from fiber._cli.doctor_capacity import refusing_quota, refusing_range, requests_of, room
 from fiber._cli.doctor_facts import Answer, Facts, FirstAnswer, NoPlace, Place
@@ -22,6 +24,7 @@ from fiber._cli.doctor_rights import (
     Right,
 )
 from fiber._cli.doctor_verdicts import State, Verdict, fault, note, ok, unknown
+from fiber._cli.failures import no_image
 from fiber._cli.pool_access import account_of_program, condition, is_of_program, program_of
 from fiber.config import Config
 from fiber.errors import ConfigError
@@ -33,10 +36,7 @@ from fiber_api.times import format_time, parse_time
 MOST_SKEW = 60.0
 """Seconds that two clocks may differ.  Leases and certificates compare them."""
 
-INSTALL = (
-    "`helm install fiber-operator charts/fiber-operator --namespace fiber-system "
-    "--create-namespace`, or choose another cluster with --context"
-)
+INSTALL = f"`{install_command()}`, or choose another cluster with --context"
 
 
 class Check(NamedTuple):
@@ -361,7 +361,10 @@ def _account(facts: Facts) -> Iterator[Verdict]:
 
 
 def _image(facts: Facts) -> Iterator[Verdict]:
-    if isinstance(facts.image, ConfigError):
+    if isinstance(facts.image, ImageMissing):
+        missing = no_image()
+        yield fault(missing.what, missing.why, missing.remedy)
+    elif isinstance(facts.image, ConfigError):
         yield fault(
             "the pod template cannot be made",
             str(facts.image),

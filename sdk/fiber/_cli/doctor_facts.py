@@ -18,7 +18,12 @@ from typing import Any, NamedTuple
 
 from fiber import config
 from fiber._backends.kubernetes.api import Api, ApiRequest, ApiSession, Login, network_errors
-from fiber._backends.kubernetes.template import PodShape, own_container, pod_template
+from fiber._backends.kubernetes.template import (
+    ImageMissing,
+    PodShape,
+    own_container,
+    pod_template,
+)
 from fiber._cli.doctor_rights import (
     ACCOUNT_RIGHTS,
     PROGRAM_RIGHTS,
@@ -182,6 +187,10 @@ class Gatherer:
         try:
             template = pod_template(PodShape.of(settings), None, "")
             return (image_in(template), self._source(settings, template)), template
+        except ImageMissing as error:
+            if settings.pool is None:
+                return error, {}
+            return ("that of its pods", f"the FiberPool {settings.pool!r}"), {}
         except ConfigError as error:
             return error, {}
 

@@ -8,6 +8,7 @@ from fiber_api import names
 from fiber_api.rest import (
     ACCOUNTS,
     CLAIMS,
+    EVENTS,
     JOBS,
     LEASES,
     PODS,
@@ -76,6 +77,7 @@ RUNNER_RIGHTS = (
     *_all("get", ACCOUNTS),
     *_all("create delete get list", JOBS),
     *_all("get", PODS, "log"),
+    *_all("list", EVENTS),
 )
 """Rights of the chart's role fiber-runner, for people who use ``fiber run``."""
 

@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import fiber
-from fiber._backends.kubernetes.template import WORKER_IMAGE
 from fiber._cli.display import counted
 from fiber._cli.doctor_attempt import TrialCourse, mismatch_in
 from fiber._cli.doctor_verdicts import Verdict, fault, note, ok
@@ -174,7 +173,7 @@ def _of_image(reason: str, message: str, program: Program) -> Verdict | None:
         return fault(
             f"the worker's container of the image {program.image!r} ends at once",
             message,
-            f"see its log with `kubectl logs`, and try the image {WORKER_IMAGE} with --image",
+            f"see its log with `kubectl logs`, or {_rebuild(program)}",
         )
     return None
 

@@ -23,6 +23,7 @@ import difflib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
+from fiber._backends.kubernetes.published import SET_IMAGE, install_command, reason_for_no_image
 from fiber.errors import ConfigError, FiberError
 from fiber_api.rest import ApiError, Forbidden, NotServed, Transient, Unauthorized
 
@@ -72,6 +73,16 @@ def not_found(kind: str, name: str, existing: Iterable[str], where: str) -> Comm
     )
 
 
+def no_image() -> CommandError:
+    """Return the error for pods without an image."""
+    return CommandError(
+        "there is no image for workers",
+        reason_for_no_image(),
+        f"name one with --image, or {SET_IMAGE}",
+        USAGE,
+    )
+
+
 @contextmanager
 def explained(doing: str) -> Iterator[None]:
     """Turn errors of the API server and of the configuration into a ``CommandError``.
@@ -98,13 +109,12 @@ def explained(doing: str) -> Iterator[None]:
         raise CommandError(
             f"cannot {doing}",
             "the cluster knows no FiberPools",
-            "install the operator: `helm install fiber-operator charts/fiber-operator "
-            "--namespace fiber-system --create-namespace`",
+            f"install the operator: `{install_command()}`",
         ) from error
     except Transient as error:
         raise CommandError(
             f"cannot {doing}",
-            f"the API server does not answer: {error.message}",
+            f"the API server does not answer: {' '.join(error.message.split())}",
             "check the network and the kubeconfig (`kubectl cluster-info`), then try again",
             NO_ANSWER,
         ) from error

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import http.client
+import re
 import signal
 import time
 from collections.abc import Callable
@@ -22,6 +23,7 @@ from fiber._cli.session import Session
 from fiber.launcher import ALIVE, DROPPED, EXIT, FAILED, STDERR
 from fiber_api import names
 from fiber_api.rest import (
+    EVENTS,
     JOBS,
     PODS,
     ApiError,
@@ -141,7 +143,8 @@ class _Following:
                     raise CommandError(
                         f"there is a program {self.name!r} already",
                         "a program that has ended keeps its name for an hour",
-                        f"choose another name, or `fiber stop {self.name}`",
+                        f"choose another name, follow it with `fiber run --attach {self.name}`, or "
+                        f"delete it with `fiber stop {self.name} --now`",
                     ) from error
 
     def _made(self) -> Body | None:
@@ -168,7 +171,10 @@ class _Following:
                         return pod
                     if pod is None:
                         self._check_job(self._read_job())
-                    state = "no pod yet" if pod is None else f"its pod {pod.state}"
+                        state = self._why_no_pod()
+                    else:
+                        self._check_pod(pod)
+                        state = f"its pod {pod.state}"
                 except Transient as error:
                     state = f"the API server does not answer ({error.message})"
             looks += 1
@@ -188,6 +194,28 @@ class _Following:
                 + (" any longer" if over["type"] == "Complete" else ""),
                 " ".join(str(over.get("message") or over.get("reason") or "it ended").split()),
                 f"see `kubectl describe job {self.name} -n {self._session.namespace}`",
+            )
+
+    def _why_no_pod(self) -> str:
+        """Return why the Job has no pod, in words: a quota, for example, or a missing account."""
+        about = f"involvedObject.kind=Job,involvedObject.name={self.name},reason=FailedCreate"
+        path = EVENTS.path(self._session.namespace)
+        with contextlib.suppress(ApiError):  # many accounts may not read events
+            found = self._session.api.list(path, {"fieldSelector": about}, timeout=5.0)
+            for event in found.get("items") or ():
+                said = " ".join(str(event.get("message")).split())
+                # Each attempt has a pod with another name.
+                return "no pod yet: " + re.sub(f'"{self.name}-[a-z0-9]*"', self.name, said)
+        return "no pod yet"
+
+    def _check_pod(self, pod: ProgramPod) -> None:
+        """Raise CommandError if the pod will never run."""
+        if pod.state.startswith("waits: InvalidImageName"):
+            self.give_up()
+            raise CommandError(
+                f"the program {self.name!r} cannot start",
+                f"its pod {pod.state}",
+                "correct the name of the image: --image, or `image` of the configuration",
             )
 
     def _read_job(self) -> Body:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import click
 
 from fiber._cli import local_logs, streams
-from fiber._cli.failures import USAGE, CommandError, explained, not_found
+from fiber._cli.failures import NOT_FOUND, USAGE, CommandError, explained, not_found
 from fiber._cli.local import find_local
 from fiber._cli.log_following import follow_log
 from fiber._cli.programs import find_job, find_pod
@@ -19,6 +19,13 @@ from fiber_api.rest import PODS, NotFound
 
 _UNITS = {"s": 1, "m": 60, "h": 3600, "d": 86_400}
 _BROKEN_PIPE = 141
+_WHY_EMPTY = {
+    names.PROGRAM_CONTAINER: "the log is empty; a node keeps only the last 10 MiB or so of it",
+    names.WORKER_CONTAINER: (
+        "the worker's own log is empty; what its tasks print is in the program's: fiber logs NAME"
+    ),
+}
+"""Hints by container."""
 
 
 @click.command("logs")
@@ -72,15 +79,23 @@ def _show(session: Session, pod: str, query: dict[str, str], follow: bool) -> No
     try:
         if follow:
             follow_log(session, pod, query)
-        else:
-            for piece in session.api.log(PODS.path(session.namespace, pod), query):
-                streams.write(piece)
+        elif not _show_now(session, pod, query) and "sinceSeconds" not in query:
+            streams.say(f"[fiber] {_WHY_EMPTY[query['container']]}")
     except NotFound as error:
         raise CommandError(
             f"there is no pod {pod!r} any longer",
             error.message,
             f"see `kubectl get pods -n {session.namespace}` for those that there are",
         ) from error
+
+
+def _show_now(session: Session, pod: str, query: dict[str, str]) -> bool:
+    """Show the log, and return whether it has anything."""
+    found = False
+    for piece in session.api.log(PODS.path(session.namespace, pod), query):
+        streams.write(piece)
+        found = True
+    return found
 
 
 def _pod(session: Session, program: str) -> str:
@@ -97,6 +112,13 @@ def _pod(session: Session, program: str) -> str:
 def _worker(session: Session, program: str, worker: str) -> str:
     """Return ``worker`` if it is one of the program's."""
     found = workers_of(session, program)
+    if not found:
+        raise CommandError(
+            f"there is no worker {worker!r}",
+            f"the program {program!r} has no workers now",
+            f"see its own output: `fiber logs {program}`",
+            NOT_FOUND,
+        )
     if worker not in found:
         raise not_found("worker", worker, found, f"the program {program!r}")
     return worker

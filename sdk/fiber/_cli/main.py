@@ -18,6 +18,7 @@ _COMMANDS = {
     "ps": "List the programs of this machine and of the cluster.",
     "logs": "Show the output of a program, or of a worker.",
     "stop": "End a program.",
+    "top": "Show what a program does now.",
     "stack": "Show where a program and its workers are in their code.",
     "pool": "List, make and scale FiberPools.",
     "doctor": "Find out why programs do not get workers.",

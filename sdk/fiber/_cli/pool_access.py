@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from fiber._cli.failures import CommandError, explained, not_found
-from fiber._cli.session import SECONDS, Session, connect
+from fiber._cli.session import SECONDS, Session, check_name, connect
 from fiber_api import names
 from fiber_api.names import ConditionType
 from fiber_api.rest import POOLS, Body, Conflict, Invalid, NotFound
@@ -26,7 +26,8 @@ def opened(context: str | None, namespace: str | None) -> Session:
 
 
 def path_of(session: Session, name: str) -> str:
-    """Return the path of a FiberPool."""
+    """Return the path of a FiberPool; CommandError if none can have this name."""
+    check_name("FiberPool", name)
     return POOLS.path(session.namespace, name)
 
 

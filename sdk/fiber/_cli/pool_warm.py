@@ -10,9 +10,15 @@ from typing import Any
 import click
 
 from fiber import config, resources
-from fiber._backends.kubernetes.template import PodShape, merge_template, pod_template, quantity
+from fiber._backends.kubernetes.template import (
+    ImageMissing,
+    PodShape,
+    merge_template,
+    pod_template,
+    quantity,
+)
 from fiber._cli.display import counted
-from fiber._cli.failures import CommandError, explained
+from fiber._cli.failures import CommandError, explained, no_image
 from fiber._cli.pool_access import (
     change,
     find,
@@ -122,9 +128,16 @@ def _body(name: str, workers: int, image: str | None, wishes: Resources) -> Body
             "minReplicas": workers,
             "maxReplicas": max(workers, settings.max_pods),
             "processesPerPod": settings.processes_per_pod,
-            "template": pod_template(shape, None, names.WORKER_CONTAINER),
+            "template": _template(shape),
         },
     }
+
+
+def _template(shape: PodShape) -> Body:
+    try:
+        return pod_template(shape, None, names.WORKER_CONTAINER)
+    except ImageMissing as error:
+        raise no_image() from error
 
 
 def _changes(pool: Body, workers: int, image: str | None, wishes: Resources) -> Body:

@@ -18,7 +18,7 @@ from fiber._backends.kubernetes.problems import pod_end
 from fiber._backends.kubernetes.relay_client import state_of
 from fiber._cli.failures import explained, not_found
 from fiber._cli.forward import open_socket
-from fiber._cli.session import SECONDS, Session
+from fiber._cli.session import SECONDS, Session, check_name
 from fiber.launcher import (
     ALIVE,
     DROPPED,
@@ -52,6 +52,10 @@ class ProgramPod(NamedTuple):
     document: Mapping[str, Any]
 
     @property
+    def program(self) -> str:
+        return str(self.document["metadata"]["labels"][names.LABEL_PROGRAM])
+
+    @property
     def phase(self) -> str:
         return str((self.document.get("status") or {}).get("phase", "Pending"))
 
@@ -69,6 +73,15 @@ class ProgramPod(NamedTuple):
         """True if the pod should have ended, and its node has not said so."""
         deadline = self.document["metadata"].get("deletionTimestamp")
         return bool(deadline) and parse_time(deadline) + _LOST_AFTER < time.time()
+
+    @property
+    def progress(self) -> str | None:
+        """Return running, succeeded or failed; None if it has not started, or if it is lost."""
+        if self.runs:
+            return "running"
+        if not self.has_ended or self.is_lost:
+            return None
+        return "failed" if self.exit_status or self.phase == "Failed" else "succeeded"
 
     @property
     def exit_status(self) -> int | None:
@@ -103,6 +116,7 @@ class ProgramPod(NamedTuple):
 
 def find_job(session: Session, name: str) -> Body:
     """Return the Job of a program; CommandError with the nearest name if there is none."""
+    check_name("program", name)
     with explained(f"look for the program {name!r}"):
         try:
             job = session.api.get(JOBS.path(session.namespace, name), timeout=SECONDS)

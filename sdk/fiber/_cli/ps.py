@@ -11,7 +11,7 @@ from fiber._backends.kubernetes.api import Login
 from fiber._cli import display
 from fiber._cli.failures import CommandError, explained
 from fiber._cli.local import local_programs
-from fiber._cli.programs import list_jobs
+from fiber._cli.programs import ProgramPod, list_jobs
 from fiber._cli.session import Session, cluster_options, connect, output_option
 from fiber_api import names
 from fiber_api.rest import PODS, POOLS, Body, NotServed
@@ -56,8 +56,9 @@ def command(namespace: str | None, context: str | None, output: str) -> None:
 def _of_namespace(session: Session) -> list[dict[str, Any]]:
     """Return a row for each program of the namespace."""
     jobs, pools = list_jobs(session), list_pools(session)
-    hosts = _hosts(session) if jobs else {}
-    return [*_of_jobs(jobs, pools, hosts), *_elsewhere(pools, jobs, hosts)]
+    pods = _pods(session) if jobs else []
+    hosts = {pod.name: pod.program for pod in pods}
+    return [*_of_jobs(jobs, pools, pods), *_elsewhere(pools, jobs, hosts)]
 
 
 def list_pools(session: Session) -> list[Body]:
@@ -75,39 +76,37 @@ def host_of(pool: Body) -> str:
     return identity.partition(":")[0]
 
 
-def state_of_job(job: Body) -> str:
-    """Return running, starting, succeeded or failed."""
+def state_of_job(job: Body, pod: ProgramPod | None) -> str:
+    """Return running, starting, succeeded or failed.  The Job knows it later than its pod."""
     status = job.get("status") or {}
     for condition in status.get("conditions") or ():
         if condition.get("status") == "True" and condition.get("type") in ("Complete", "Failed"):
             return "succeeded" if condition["type"] == "Complete" else "failed"
-    return "running" if status.get("ready") else "starting"
+    return (pod and pod.progress) or ("running" if status.get("ready") else "starting")
 
 
-def _hosts(session: Session) -> dict[str, str]:
-    """Return the program of each pod that has one.  A pod's name is the host of its program."""
+def _pods(session: Session) -> list[ProgramPod]:
+    """Return the pods of programs, the oldest first.  A pod's name is the host of its program."""
     with explained("list the pods of programs"):
         found = session.items(PODS, names.LABEL_PROGRAM)
-    pods = sorted(found, key=lambda pod: str(pod["metadata"]["creationTimestamp"]))
-    return {
-        str(pod["metadata"]["name"]): str(pod["metadata"]["labels"][names.LABEL_PROGRAM])
-        for pod in pods
-    }
+    found.sort(key=lambda pod: str(pod["metadata"]["creationTimestamp"]))
+    return [ProgramPod(str(pod["metadata"]["name"]), pod) for pod in found]
 
 
-def _of_jobs(jobs: list[Body], pools: list[Body], hosts: dict[str, str]) -> list[dict[str, Any]]:
+def _of_jobs(jobs: list[Body], pools: list[Body], pods: list[ProgramPod]) -> list[dict[str, Any]]:
     """Return a row for each program that ``fiber run`` has started."""
     workers: Counter[str] = Counter()
     for pool in pools:
-        if (program := hosts.get(host_of(pool))) is not None:
-            workers[program] += _ready(pool)
-    newest = {program: pod for pod, program in hosts.items()}
+        workers[host_of(pool)] += _ready(pool)
     rows = []
     for job in jobs:
         metadata = job["metadata"]
-        name = str(metadata["name"])
+        own = [pod for pod in pods if pod.program == metadata["name"]]
+        newest = own[-1] if own else None
+        state = state_of_job(job, newest)
         typed = (metadata.get("annotations") or {}).get(names.ANNOTATION_COMMAND)
-        rows.append(_row(job, state_of_job(job), workers[name], newest.get(name), typed, job=True))
+        host = newest.name if newest else None
+        rows.append(_row(job, state, sum(workers[pod.name] for pod in own), host, typed, job=True))
     return rows
 
 

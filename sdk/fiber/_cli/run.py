@@ -11,14 +11,14 @@ from typing import Any
 import click
 
 from fiber._cli import following
-from fiber._cli.failures import USAGE, CommandError, ProgramEnded, explained
+from fiber._cli.failures import NO_RIGHT, USAGE, CommandError, ProgramEnded, explained
 from fiber._cli.programs import find_job
 from fiber._cli.run_job import job_of, name_of, variables_of
 from fiber._cli.run_source import command_of, program_file, source_of
-from fiber._cli.session import Session, cluster_options, connect
+from fiber._cli.session import SECONDS, Session, cluster_options, connect
 from fiber.launcher import FAILED, NO_COMMAND, NOT_EXECUTABLE
 from fiber_api import names
-from fiber_api.rest import ACCOUNTS, ROLE_BINDINGS, Conflict, Forbidden, NotFound
+from fiber_api.rest import ACCOUNTS, ROLE_BINDINGS, ROLES, Body, Conflict, Forbidden, NotFound
 
 
 class _RunCommand(click.Command):
@@ -84,7 +84,7 @@ def command(namespace: str | None, context: str | None, **options: Any) -> int:
     try:
         if options["local"]:
             _run_here(options)
-        if options["attach"]:
+        if options["attach"] is not None:
             session = connect(context, namespace)
             return following.attach(session, find_job(session, options["attach"]))
         return _run(context, namespace, options)
@@ -102,7 +102,7 @@ def command(namespace: str | None, context: str | None, **options: Any) -> int:
 
 def _check(options: dict[str, Any]) -> None:
     starts = options["module"] or options["words"] not in ((), ("--",))
-    if options["attach"]:
+    if options["attach"] is not None:
         for given, what in (
             (starts, "a script is named"),
             (options["local"], "--local is given"),
@@ -158,19 +158,10 @@ def _ensure_account(session: Session) -> str:
     """Return the account of programs, made with the role fiber-user if it does not exist."""
     name, namespace = names.PROGRAM_ACCOUNT, session.namespace
     metadata = {"name": name, "labels": {names.LABEL_MANAGED_BY: names.SDK_MANAGER}}
-    binding = {
-        "metadata": metadata,
-        "roleRef": {
-            "apiGroup": "rbac.authorization.k8s.io",
-            "kind": "ClusterRole",
-            "name": "fiber-user",
-        },
-        "subjects": [{"kind": "ServiceAccount", "name": name, "namespace": namespace}],
-    }
     try:
         with explained("find the account of programs"):
             try:
-                session.api.get(ACCOUNTS.path(namespace, name), timeout=5.0)
+                session.api.get(ACCOUNTS.path(namespace, name), timeout=SECONDS)
                 return name
             except NotFound:
                 pass
@@ -178,10 +169,12 @@ def _ensure_account(session: Session) -> str:
                 return name  # the API server will say if it does not exist
             # The account last: the next program finds it, and does not look for its rights.
             with contextlib.suppress(Conflict):
-                session.api.create(ROLE_BINDINGS.path(namespace), binding)
+                session.api.create(ROLE_BINDINGS.path(namespace), _binding(session, metadata))
             with contextlib.suppress(Conflict):
                 session.api.create(ACCOUNTS.path(namespace), {"metadata": metadata})
     except CommandError as error:
+        if error.status != NO_RIGHT:
+            raise
         error.remedy = (
             "name an account that has the role fiber-user with --service-account, or ask an "
             f"administrator: `kubectl create serviceaccount {name} -n {namespace}` and `kubectl "
@@ -190,3 +183,31 @@ def _ensure_account(session: Session) -> str:
         )
         raise
     return name
+
+
+def _binding(session: Session, metadata: Body) -> Body:
+    """Return the binding that gives the account of programs the role fiber-user."""
+    return {
+        "metadata": metadata,
+        "roleRef": {
+            "apiGroup": "rbac.authorization.k8s.io",
+            "kind": _kind_of_role(session),
+            "name": "fiber-user",
+        },
+        "subjects": [
+            {
+                "kind": "ServiceAccount",
+                "name": names.PROGRAM_ACCOUNT,
+                "namespace": session.namespace,
+            }
+        ],
+    }
+
+
+def _kind_of_role(session: Session) -> str:
+    """Return Role if the chart was installed with ``scope=namespaced``, else ClusterRole."""
+    try:
+        session.api.get(ROLES.path(session.namespace, "fiber-user"), timeout=SECONDS)
+    except (NotFound, Forbidden):  # a person who may not read roles mostly has a ClusterRole
+        return "ClusterRole"
+    return "Role"

@@ -11,8 +11,13 @@ import sys
 from typing import Any
 
 from fiber import config, resources
-from fiber._backends.kubernetes.template import PodShape, names_secret, pod_template
-from fiber._cli.failures import USAGE, CommandError
+from fiber._backends.kubernetes.template import (
+    ImageMissing,
+    PodShape,
+    names_secret,
+    pod_template,
+)
+from fiber._cli.failures import USAGE, CommandError, no_image
 from fiber._cli.run_source import FOLDER, Source
 from fiber.errors import ConfigError
 from fiber_api import names
@@ -23,6 +28,9 @@ _FILES_WITHIN = 600
 
 _KEPT = 3600
 """Seconds that a program that has ended is kept, with its log."""
+
+_GROUP = 65532
+"""Group of the user of Fiber's images."""
 
 _LONGEST_COMMAND = 4096
 """Characters of the command line that are shown."""
@@ -101,6 +109,8 @@ def _worker_template(options: dict[str, Any], settings: config.Config) -> Body:
         if options["image"]:
             shape = dataclasses.replace(shape, image=options["image"])
         return pod_template(shape, None, "", sys.executable)
+    except ImageMissing as error:
+        raise no_image() from error
     except (ConfigError, TypeError, ValueError) as error:
         raise CommandError(
             "the program's pod cannot be made",
@@ -194,4 +204,20 @@ def _mount(spec: Body, container: Body, volumes: tuple[str, ...]) -> None:
             {"name": volume, "persistentVolumeClaim": {"claimName": claim}}
         )
         mount = {"name": volume, "mountPath": path, "readOnly": mode == "ro"}
-        container.setdefault("volumeMounts", []).append(mount)
+        mounts = container.setdefault("volumeMounts", [])
+        if any(other.get("mountPath") == path for other in mounts):
+            raise CommandError(
+                f"two volumes are mounted at {path}",
+                f"{word!r} and another --volume, or the template, name this path",
+                "choose another path",
+                USAGE,
+            )
+        mounts.append(mount)
+        if mode != "ro":
+            _let_write(spec.setdefault("securityContext", {}))
+
+
+def _let_write(context: Body) -> None:
+    """Let the user of Fiber's images write to the volumes, unless the template says who may."""
+    if "fsGroup" not in context:
+        context |= {"fsGroup": _GROUP, "fsGroupChangePolicy": "OnRootMismatch"}

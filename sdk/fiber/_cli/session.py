@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
@@ -9,11 +10,13 @@ import click
 
 from fiber import config
 from fiber._backends.kubernetes.api import Api
-from fiber._cli.failures import explained
+from fiber._cli.failures import USAGE, CommandError, explained
 from fiber_api.rest import Body, ResourceType
 
 F = TypeVar("F", bound=Callable[..., Any])
 
+
+_NAME = re.compile("[a-z0-9]([-a-z0-9.]*[a-z0-9])?")
 
 SECONDS = 5.0
 """Seconds that the API server may take for a call."""
@@ -42,7 +45,20 @@ def connect(context: str | None, namespace: str | None) -> Session:
     with explained("connect to a cluster"):
         settings = config.load()
         api = Api.connect(context or settings.context)
+        if namespace:
+            check_name("namespace", namespace)
         return Session(api, namespace or settings.namespace or api.namespace)
+
+
+def check_name(kind: str, name: str) -> None:
+    """Raise CommandError if no object can have this name.  It becomes a part of a path."""
+    if not _NAME.fullmatch(name):
+        raise CommandError(
+            f"{name!r} cannot be the name of a {kind}",
+            "a name has lower-case letters, digits, '-' and '.'",
+            f"correct the name of the {kind}",
+            USAGE,
+        )
 
 
 def cluster_options(command: F) -> F:

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import time
+from collections import deque
 from collections.abc import Callable, Iterator
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from fiber._agent.interface import ChildHandle, ExitReport
 from fiber._agent.last_words import SHOW
 from fiber._hub.handles import GrantSet
 from fiber._wire.packet import Message
+
+_DEATHS = 20
+"""Deaths that are kept for monitors."""
+
+_LONGEST_REASON = 200
 
 
 class ChildOwner(Protocol):
@@ -64,6 +71,8 @@ class Child:
         """Release unused grants, and forget the child."""
         if self._grants:
             self._grants.release()
+        if report.exitcode and self.owner.state != "leaving":
+            self._children.deaths.append(death_of(self, report))
         self._children.remove(self)
         self.showed_stack(f"It has ended: {report.describe()}.")
         self.owner.exited(report)
@@ -84,11 +93,32 @@ class Child:
             then(text)
 
 
+class Death(NamedTuple):
+    """End of a child that its program had not asked for."""
+
+    time: float
+    """Unix time."""
+    name: str
+    host: str
+    pid: int | None
+    reason: str
+
+
+def death_of(child: Child, report: ExitReport) -> Death:
+    """Return the death of a child, which has just ended."""
+    handle = child.handle
+    assert handle is not None
+    reason = report.describe()[:_LONGEST_REASON]
+    return Death(time.time(), handle.name, report.host or handle.host, handle.pid, reason)
+
+
 class Children:
     """Children that were started and have not ended.  Runs on the loop thread."""
 
     def __init__(self) -> None:
         self._children: dict[Child, None] = {}
+        self.deaths: deque[Death] = deque(maxlen=_DEATHS)
+        """Last children that ended, and that this program had not asked to end."""
 
     def add(self, child: Child) -> None:
         """Note that a child is being started."""

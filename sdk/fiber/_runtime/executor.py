@@ -37,6 +37,7 @@ from fiber._runtime.exchange import AnswerReceiver, BatchSender
 from fiber._runtime.jobs import TICK, CallQueue, Calls, Jobs
 from fiber._runtime.leases import ADOPTED, UNAVAILABLE, LeasedWorker, Leases
 from fiber._runtime.options import PoolOptions
+from fiber._runtime.pool_state import PoolState, pool_state
 from fiber._runtime.state import Runtime
 from fiber._runtime.threads import BackgroundThread, Latch, UserThreads, say
 from fiber._runtime.work_items import (
@@ -132,6 +133,8 @@ class PoolExecutor:
         """Error of calls that are not done when the pool is terminated."""
         self._acting = False
         self._again = False
+        self._done_before = 0
+        """Number of tasks that workers did which are gone."""
 
     # Requests, on any thread
 
@@ -144,6 +147,7 @@ class PoolExecutor:
             if self.options.calls_back_at_end:  # after the program's end no thread starts
                 self.threads.start()
             self._loop.depend(self)
+            self._loop.call_soon(self._runtime.pools.add, self)
         except BaseException:
             self._end()
             raise
@@ -383,6 +387,12 @@ class PoolExecutor:
         self._jobs.lift_limits()
         self._advance()
 
+    def describe(self) -> PoolState:
+        """Return the state of the pool, for monitors."""
+        return pool_state(
+            self._ledger, self._scheduler.workers, self._done_before, self._loop.now()
+        )
+
     # Decisions
 
     def _advance(self) -> None:
@@ -521,6 +531,7 @@ class PoolExecutor:
     def _lost(
         self, handle: WorkerHandle, failure: StartFailure | None, report: ExitReport | None = None
     ) -> None:
+        self._done_before += handle.tasks
         now = self._loop.now()
         unread: set[int] = set()
         running = None
@@ -572,6 +583,7 @@ class PoolExecutor:
         """Finish: the last worker has ended."""
         if self.ended.is_set():
             return
+        self._runtime.pools.discard(self)
         if self._wake is not None:
             self._wake.cancel()
         self._launcher.close()

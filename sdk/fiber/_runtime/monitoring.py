@@ -4,6 +4,8 @@ Each answer begins with ``{"program": …}``, the facts of the program.  The req
 what follows:
 
 ``children``  ``{"child": …}`` for each child
+``state``     ``{"pool": …}`` for each pool (``PoolState``), ``{"child": …}`` for each child, and
+              ``{"death": …}`` for the last children that ended by themselves
 ``stacks``    ``{"stack": …}`` for the program itself and for each child, as the answers come.  With
               ``worker``, only for the child of that name or pid, or for the children on that host
 """
@@ -17,12 +19,13 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from types import FrameType
 from typing import Any, TypeVar, cast
 
 from fiber._runtime.children import Child, Children
+from fiber._runtime.pool_state import WatchedPool
 from fiber._transport.loop import Loop
 from fiber.config import Config
 from fiber.errors import FiberError
@@ -41,9 +44,17 @@ _LONGEST_COMMAND = 1000
 class Monitor:
     """Source of what a monitor wants to know.  Runs on the thread of a client."""
 
-    def __init__(self, loop: Loop, children: Children, backend: str, config: Config) -> None:
+    def __init__(
+        self,
+        loop: Loop,
+        children: Children,
+        pools: Iterable[WatchedPool],
+        backend: str,
+        config: Config,
+    ) -> None:
         self._loop = loop
         self._children = children
+        self._pools = pools
         self._backend = backend
         self._config = config
 
@@ -54,6 +65,8 @@ class Monitor:
         if ask == "children":
             for facts in self._on_loop(self._describe_children):
                 yield {"child": facts}
+        elif ask == "state":
+            yield from self._on_loop(self._state)
         elif ask == "stacks":
             yield from self._stacks(request.get("worker"))
         elif ask is not None:
@@ -77,6 +90,12 @@ class Monitor:
             raise FiberError(
                 f"the program's event loop has not answered within {_LOOP_PATIENCE:.0f} s"
             ) from None
+
+    def _state(self) -> list[dict[str, Any]]:
+        pools = [{"pool": pool.describe()._asdict()} for pool in list(self._pools)]
+        children = [{"child": facts} for facts in self._describe_children()]
+        deaths = [{"death": death._asdict()} for death in self._children.deaths]
+        return [*pools, *children, *deaths]
 
     def _describe_children(self) -> list[dict[str, Any]]:
         return [_facts(child) for child in self._children]

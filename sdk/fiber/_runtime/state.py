@@ -11,6 +11,7 @@ import os
 import pickle
 import sys
 import threading
+import weakref
 from collections.abc import Iterator
 from dataclasses import replace
 from multiprocessing import process as mp_process
@@ -26,6 +27,7 @@ from fiber._hub.hub import Hub
 from fiber._monitor.server import MonitorServer
 from fiber._runtime import start_methods
 from fiber._runtime.children import Child, ChildOwner, Children
+from fiber._runtime.pool_state import WatchedPool
 from fiber._transport.channels import naming_the_limit
 from fiber._transport.loop import Loop
 from fiber._wire.memory_files import Blob
@@ -53,6 +55,8 @@ class Runtime:
         self.host = child.host or "local"
         self.hub: Hub | None = None
         self.children = Children()
+        self.pools: weakref.WeakSet[WatchedPool] = weakref.WeakSet()
+        """Executors with workers.  Only the loop thread adds and removes them."""
         self._monitor: MonitorServer | None = None
         self._unwatched = threading.Lock()
         """Lock that the first child takes for ever: it opens the monitor."""
@@ -143,7 +147,8 @@ class Runtime:
     def _answer_monitor(self, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
         from fiber._runtime.monitoring import Monitor  # rarely needed
 
-        return Monitor(self.loop, self.children, self.backend.name, self.config).answer(request)
+        monitor = Monitor(self.loop, self.children, self.pools, self.backend.name, self.config)
+        return monitor.answer(request)
 
     def _preparation(self, process: Any, *, anew: bool) -> tuple[bytes, PackedProgram | None]:
         """Return the preparation data of a child, and its files; ``anew`` as in ``Shipping``."""

@@ -19,6 +19,7 @@ from fiber._backends.kubernetes.api import Api
 from fiber._backends.kubernetes.attached_pool import AttachedPool
 from fiber._backends.kubernetes.informer import Informer
 from fiber._backends.kubernetes.problems import PoolName, Reporter
+from fiber._backends.kubernetes.published import install_command
 from fiber._exceptions import fresh
 from fiber._transport.loop import Loop
 from fiber.errors import FiberPoolError
@@ -44,7 +45,7 @@ CLOSE_TIMEOUT = 10.0
 _NO_STATUS = (
     "was not reconciled by an operator for {seconds:.0f} s. Check that one runs and serves this "
     "namespace (`kubectl get deployments -A -l app.kubernetes.io/name=fiber-operator`), or install "
-    "it: `helm install fiber-operator charts/fiber-operator -n fiber-system --create-namespace`"
+    f"it: `{install_command()}`"
 )
 _NO_SIGNATURE = (
     "has no valid signature for this program in its status after {seconds:.0f} s, so no agent "

@@ -15,6 +15,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
+from fiber._backends.kubernetes.published import install_command
 from fiber._transport.loop import Loop
 from fiber.errors import FiberPoolError
 from fiber_api import names
@@ -396,8 +397,7 @@ def _advice(error: ApiError, namespace: str, server: str) -> tuple[str, str]:
         case NotServed():
             return "NotInstalled", (
                 f"The cluster at {server} knows no FiberPools: install the operator with its chart "
-                " (`helm install fiber-operator charts/fiber-operator -n fiber-system "
-                "--create-namespace`), or choose another cluster with fiber.init(context=)"
+                f"(`{install_command()}`), or choose another cluster with fiber.init(context=)"
             )
         case NotFound() if error.message.startswith("namespaces "):
             return "NamespaceNotFound", (

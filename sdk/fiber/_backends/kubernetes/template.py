@@ -21,7 +21,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import fiber
+from fiber._backends.kubernetes.published import SET_IMAGE, reason_for_no_image, worker_image
 from fiber.config import Config
 from fiber.errors import ConfigError
 from fiber.resources import GPU, Resources, merged, wished
@@ -29,13 +29,14 @@ from fiber_api import names
 
 Document = dict[str, Any]
 
-WORKER_IMAGE = f"fiber-worker:{fiber.__version__}"
-"""Image of workers by default, as charts and manifests name it."""
-
 _SHM = "/dev/shm"
 _SHM_VOLUME = "fiber-shm"
 
 _AGENT = ("-m", "fiber.agent")
+
+
+class ImageMissing(ConfigError):
+    """Error for a program without an image, in a build that has no published one."""
 
 
 # ---- the pod template -----------------------------------------------------------------------
@@ -44,7 +45,7 @@ _AGENT = ("-m", "fiber.agent")
 def pod_template(
     shape: PodShape, own_pod: Mapping[str, Any] | None, container: str, python: str = "python"
 ) -> Document:
-    """Return the template of a shape's pods.
+    """Return the template of a shape's pods; ImageMissing if they would have no image.
 
     ``own_pod``: pod of this program, or None.  ``container`` and ``python``: container of the
     program in that pod, and its interpreter there.
@@ -52,7 +53,7 @@ def pod_template(
     spec = _like(own_pod, container) if own_pod is not None else _elsewhere()
     worker = spec["containers"][0]
     own_image = worker["image"] if own_pod is not None else None
-    if shape.image is not None and shape.image != worker["image"]:
+    if shape.image is not None and shape.image != worker.get("image"):
         worker["image"] = shape.image
         worker.pop("imagePullPolicy", None)  # of the image before
     _ask_for(worker, shape)
@@ -61,6 +62,7 @@ def pod_template(
         _give_shm(spec, worker, shape.shm)
     template = merge_template({"spec": spec}, json.loads(shape.template))
     for worker in _workers(template):
+        _check_image(worker)
         _request_the_rest(worker, shape)
         if not ("command" in worker or "args" in worker):
             # The default command of the image may be the program, which must not start again.
@@ -70,7 +72,16 @@ def pod_template(
 
 
 def _elsewhere() -> Document:
-    return {"containers": [{"name": names.WORKER_CONTAINER, "image": WORKER_IMAGE}]}
+    image = worker_image()
+    published = {} if image is None else {"image": image}
+    return {"containers": [{"name": names.WORKER_CONTAINER, **published}]}
+
+
+def _check_image(worker: Document) -> None:
+    if not worker.get("image"):
+        raise ImageMissing(
+            f"there is no image for workers: {reason_for_no_image()}. To run on pods, {SET_IMAGE}"
+        )
 
 
 def _workers(template: Document) -> Iterator[Document]:
