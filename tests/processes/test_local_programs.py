@@ -33,6 +33,20 @@ if __name__ == "__main__":
 """
 
 
+_SCRIPT_WITH_TWO_RUNTIMES = """
+import fiber
+from fiber._runtime.state import shutdown
+
+if __name__ == "__main__":
+    for _ in range(2):
+        process = fiber.Process(target=print, args=("begun",))
+        process.start()
+        process.join()
+        input()
+        shutdown()
+"""
+
+
 @pytest.fixture(autouse=True)
 def _only_this_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """No cluster is configured, and no other test's programs are seen."""
@@ -72,6 +86,22 @@ def test_a_program_is_listed(program: Program) -> None:
     assert row["command"].endswith(str(program.script))
     assert row["created"].endswith("Z")
     assert name_of(program) in run("ps").out
+
+
+def test_a_program_is_listed_again_after_its_runtime_has_ended() -> None:
+    program = Program(_SCRIPT_WITH_TWO_RUNTIMES, stdin=subprocess.PIPE)
+    stdin = program.process.stdin
+    assert stdin is not None
+    try:
+        for _ in range(2):
+            assert program.line() == "begun"
+            (row,) = json.loads(run("ps", "--output", "json").out)
+            assert (row["state"], row["pid"]) == ("running", program.pid)
+            stdin.write(b"\n")
+            stdin.flush()
+    finally:
+        program.close()
+        stdin.close()
 
 
 def test_no_program_is_listed_without_an_error() -> None:

@@ -14,7 +14,6 @@ import fiber
 from census import wait_until
 from faults import pool_targets as tasks
 from fiber._monitor import client
-from fiber._runtime import state
 from fiber.pool import Pool
 from patience import PATIENCE
 
@@ -95,15 +94,6 @@ def test_no_stack_is_written_into_a_file_of_the_user(
     assert "has closed the file for its stacks" in stack_of("target")
     assert path.read_bytes() == b""
     assert process.is_alive()
-
-
-def test_the_program_listens_again_after_its_runtime_has_ended() -> None:
-    for _ in range(2):
-        with fiber.Pool(1) as pool:
-            pool.apply(abs, (-1,))
-            assert len(ask(ask="children")) == 1
-        pool.join()
-        state.shutdown()
 
 
 def test_an_idle_worker_shows_that_it_waits(pool: Pool) -> None:
