@@ -52,7 +52,7 @@ def test_a_worker_that_hangs_in_native_code_shows_its_stack_and_goes_on(pool: Po
 
 def test_a_worker_whose_threads_run_goes_on(pool: Pool) -> None:
     # faulthandler crashes on the frames of threads that run.
-    assert pool.apply(tasks.run_threads_while_shown, (300,)) == 300
+    assert pool.apply(tasks.run_threads_while_shown, (100,)) == 100
 
 
 @pytest.fixture
