@@ -16,13 +16,10 @@ import tarfile
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from faults.program import wait_for
-from fiber import launcher
-from fiber._monitor import client
 from fiber.launcher import (
     ALIVE,
     DROPPED,
@@ -507,17 +504,6 @@ def test_a_question_is_passed_on_to_the_programs_monitor(
     with pod.ask("POST", "/monitor", b'{"ask": "stack"}', **question) as response:
         answers = [json.loads(line) for line in response]
     assert {"answer": {"ask": "stack"}} in answers
-
-
-def test_a_program_that_does_not_answer_the_launcher_is_named_so(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def silent(*_: object) -> Iterator[dict[str, Any]]:
-        raise client.NoAnswer("the program does not answer within 10 s")
-
-    monkeypatch.setattr(client, "ask", silent)
-    (line,) = launcher._answers("path", {})
-    assert line["error"].startswith("the program does not answer within 10 s")
 
 
 @pytest.mark.parametrize("size", ["70000", "-1", "many"])

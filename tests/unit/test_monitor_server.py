@@ -166,6 +166,18 @@ def test_a_program_that_does_not_answer_is_given_up(folder: Path) -> None:
         assert client.pid_of(str(path)) == os.getpid()
 
 
+def test_a_program_that_does_not_answer_is_named_among_all(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def silent(*_: object) -> Iterator[dict[str, Any]]:
+        raise client.NoAnswer("the program does not answer within 10 s")
+
+    monkeypatch.setattr(client, "sockets", lambda _: ["path"])
+    monkeypatch.setattr(client, "ask", silent)
+    (line,) = client.ask_all(str(folder.parent), {})
+    assert line["error"].startswith("the program does not answer within 10 s")
+
+
 def test_a_folder_that_others_may_write_to_is_left_out(folder: Path) -> None:
     (folder / server.SOCKET).touch()
     folder.chmod(0o777)

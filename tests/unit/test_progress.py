@@ -14,8 +14,15 @@ from census import wait_until
 from fiber import _logs
 from fiber._runtime import progress_views
 from fiber._runtime.answers import TaskFailure
-from fiber._runtime.progress import Progress, ProgressFuture, ProgressReporter
-from fiber._runtime.progress_views import BarView, LineView, RichView, choose_view, line
+from fiber._runtime.progress import ProgressFuture, ProgressReporter
+from fiber._runtime.progress_views import (
+    BarView,
+    LineView,
+    MapProgress,
+    RichView,
+    choose_view,
+    line,
+)
 from fiber._runtime.work_items import WorkItem
 from fiber._wire import work
 from patience import PATIENCE
@@ -48,13 +55,13 @@ class Looks:
     """A view that notes what it shows."""
 
     def __init__(self) -> None:
-        self.shown: list[Progress] = []
-        self.last: Progress | None = None
+        self.shown: list[MapProgress] = []
+        self.last: MapProgress | None = None
 
-    def show(self, progress: Progress) -> None:
+    def show(self, progress: MapProgress) -> None:
         self.shown.append(progress)
 
-    def finish(self, progress: Progress) -> None:
+    def finish(self, progress: MapProgress) -> None:
         self.last = progress
 
 
@@ -62,9 +69,9 @@ def item_of(future: Future) -> WorkItem:
     return WorkItem(work.MAP, future=future)
 
 
-def progress(**facts: Any) -> Progress:
+def progress(**facts: Any) -> MapProgress:
     usual = {"name": "f", "done": 0, "total": 10, "failed": 0, "lost": 0, "busy": 0, "seconds": 0.0}
-    return Progress(**{**usual, **facts})
+    return MapProgress(**{**usual, **facts})
 
 
 def is_shown() -> bool:

@@ -23,7 +23,7 @@ class NoAnswer(Exception):
     """Error: the program does not answer, or has ended; the message says which."""
 
 
-class Ended(NoAnswer):
+class ProgramGone(NoAnswer):
     """Error: the program has ended."""
 
 
@@ -53,11 +53,22 @@ def ask(
                     yield json.loads(line)
         except ConnectionRefusedError as error:
             _remove_leftovers(os.path.dirname(path))
-            raise Ended("the program has ended") from error
+            raise ProgramGone("the program has ended") from error
         except (TimeoutError, BlockingIOError) as error:  # or too many clients wait already
             raise NoAnswer(f"the program does not answer within {patience:.0f} s") from error
         except (OSError, ValueError) as error:
-            raise Ended(f"the program has ended: {error}") from error
+            raise ProgramGone(f"the program has ended: {error}") from error
+
+
+def ask_all(parent: str | None, request: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    """Yield the lines of the answers of all programs, or that one does not answer."""
+    for path in sockets(parent):
+        try:
+            yield from ask(path, request)
+        except ProgramGone:
+            pass
+        except NoAnswer as error:
+            yield {"error": f"{error}: a native function may hold Python's lock"}
 
 
 def pid_of(path: str) -> int | None:

@@ -76,6 +76,7 @@ class Child:
         self._children.remove(self)
         self.showed_stack(f"It has ended: {report.describe()}.")
         self.owner.exited(report)
+        self.handle = None  # it has this object as its observer: a cycle
 
     def ask_for_stack(self, then: Callable[[str], None]) -> None:
         """Call ``then`` with the Python stacks of the child's threads, or why there are none."""

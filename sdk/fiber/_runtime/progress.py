@@ -11,43 +11,14 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterable, Sized
-from typing import Any, NamedTuple
+from typing import Any
 
 from fiber._runtime.answers import is_failure
-from fiber._runtime.progress_views import View, choose_view
+from fiber._runtime.progress_views import MapProgress, View, choose_view
 from fiber._runtime.work_items import WorkItem
 
 INTERVAL = 0.2
 """Seconds between two looks."""
-
-
-class Progress(NamedTuple):
-    """Progress of a map at one moment."""
-
-    name: str
-    """Label of the map: the user's, or the name of the function."""
-    done: int
-    total: int | None
-    """Number of tasks; None while the input is being read."""
-    failed: int
-    lost: int
-    """Runs that were lost with their workers."""
-    busy: int
-    """Workers at work in the pool."""
-    seconds: float
-    """Seconds since the map began."""
-
-    @property
-    def rate(self) -> float:
-        """Tasks a second since the map began."""
-        return self.done / self.seconds if self.seconds > 0 else 0.0
-
-    @property
-    def left(self) -> float | None:
-        """Seconds until the end at this rate; None if that is not known."""
-        if self.total is None or not self.done:
-            return None
-        return (self.total - self.done) / self.rate
 
 
 class ProgressFuture:
@@ -100,7 +71,7 @@ class ProgressFuture:
         """True once no result will come: the map has its results, has failed, or is cancelled."""
         return self._is_over or (self.item.job is not None and self.item.future is None)
 
-    def look(self) -> Progress:
+    def look(self) -> MapProgress:
         """Return the progress now."""
         job = self.item.job
         total = self._total
@@ -108,7 +79,7 @@ class ProgressFuture:
             total = job.fed
         lost = 0 if job is None else job.charges.lost
         seconds = time.monotonic() - self._began
-        return Progress(self._name, self._done, total, self._failed, lost, self._busy(), seconds)
+        return MapProgress(self._name, self._done, total, self._failed, lost, self._busy(), seconds)
 
 
 Busy = Callable[[], int]

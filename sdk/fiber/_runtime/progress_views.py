@@ -9,24 +9,50 @@ from __future__ import annotations
 import contextlib
 import sys
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from fiber import _logs
-
-if TYPE_CHECKING:
-    from fiber._runtime.progress import Progress
 
 LINE_INTERVAL = 10.0
 """Seconds between two lines."""
 
 
+class MapProgress(NamedTuple):
+    """Progress of a map at one moment."""
+
+    name: str
+    """Label of the map: the user's, or the name of the function."""
+    done: int
+    total: int | None
+    """Number of tasks; None while the input is being read."""
+    failed: int
+    lost: int
+    """Runs that were lost with their workers."""
+    busy: int
+    """Workers at work in the pool."""
+    seconds: float
+    """Seconds since the map began."""
+
+    @property
+    def rate(self) -> float:
+        """Tasks a second since the map began."""
+        return self.done / self.seconds if self.seconds > 0 else 0.0
+
+    @property
+    def left(self) -> float | None:
+        """Seconds until the end at this rate; None if that is not known."""
+        if self.total is None or not self.done:
+            return None
+        return (self.total - self.done) / self.rate
+
+
 class View(Protocol):
     """View of one map."""
 
-    def show(self, progress: Progress) -> None:
+    def show(self, progress: MapProgress) -> None:
         """Show the progress now."""
 
-    def finish(self, progress: Progress) -> None:
+    def finish(self, progress: MapProgress) -> None:
         """Show the last progress, and leave it."""
 
 
@@ -61,7 +87,7 @@ class BarView:
         self._type: Any = type("Bar", (tqdm,), {"monitor_interval": 0})
         self._bar: Any = None
 
-    def show(self, progress: Progress) -> None:
+    def show(self, progress: MapProgress) -> None:
         """Draw the bar."""
         if self._bar is None:
             _logs.write_around = self._type.external_write_mode
@@ -73,7 +99,7 @@ class BarView:
         self._bar.set_postfix_str(facts(progress), refresh=False)
         self._bar.refresh()
 
-    def finish(self, progress: Progress) -> None:
+    def finish(self, progress: MapProgress) -> None:
         """Draw the bar for the last time."""
         self.show(progress)
         self._bar.close()
@@ -97,7 +123,7 @@ class RichView:
         )
         self._task: Any = None
 
-    def show(self, progress: Progress) -> None:
+    def show(self, progress: MapProgress) -> None:
         """Draw the bar."""
         if self._task is None:
             self._bars.start()
@@ -107,7 +133,7 @@ class RichView:
         )
         self._bars.refresh()
 
-    def finish(self, progress: Progress) -> None:
+    def finish(self, progress: MapProgress) -> None:
         """Draw the bar for the last time."""
         self.show(progress)
         self._bars.stop()
@@ -120,22 +146,22 @@ class LineView:
         self._write = write
         self._next = LINE_INTERVAL
 
-    def show(self, progress: Progress) -> None:
+    def show(self, progress: MapProgress) -> None:
         """Print a line if the last one is old."""
         if progress.seconds >= self._next:
             self._next = progress.seconds + LINE_INTERVAL
             self._print(progress)
 
-    def finish(self, progress: Progress) -> None:
+    def finish(self, progress: MapProgress) -> None:
         """Print the last line."""
         self._print(progress)
 
-    def _print(self, progress: Progress) -> None:
+    def _print(self, progress: MapProgress) -> None:
         with contextlib.suppress(OSError, ValueError, AttributeError):  # no such stream
             (self._write or sys.stderr.write)(line(progress) + "\n")
 
 
-def line(progress: Progress) -> str:
+def line(progress: MapProgress) -> str:
     """Return the progress in one line."""
     total = "" if progress.total is None else f" of {progress.total}"
     parts = [f"{progress.done}{total} tasks", f"{progress.rate:.1f}/s"]
@@ -148,7 +174,7 @@ def line(progress: Progress) -> str:
     return f"[fiber] {progress.name}: {', '.join(parts)}"
 
 
-def facts(progress: Progress) -> str:
+def facts(progress: MapProgress) -> str:
     """Return the facts that a bar does not show by itself."""
     parts = [f"{progress.failed} failed"] if progress.failed else []
     parts += [f"{progress.lost} lost with workers"] if progress.lost else []
