@@ -64,6 +64,10 @@ _ERASE = "\r\x1b[K"
 """Control characters that erase the last line of a terminal."""
 
 
+write_around: Any = contextlib.nullcontext
+"""Context manager around each write to stderr: a bar of the progress clears the line there."""
+
+
 class OutputWriter:
     """Writer of lines to stderr, on a thread.  A slow, stuck or broken stderr blocks no caller.
 
@@ -146,7 +150,7 @@ class OutputWriter:
             with self._lock:
                 line, self._redraws = self._line, False
             # A full disk or a closed terminal costs only the lines.
-            with contextlib.suppress(OSError, ValueError):
+            with contextlib.suppress(OSError, ValueError), write_around():
                 _write(f"{_ERASE if shown else ''}{lines}{line}")
             shown = line
             with self._lock:

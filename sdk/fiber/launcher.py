@@ -466,10 +466,9 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_error(400)
             return
         self._answer()
-        for path in client.sockets():
-            with contextlib.suppress(client.NoAnswer):
-                for line in client.ask(path, request):
-                    self.wfile.write(json.dumps(line).encode() + b"\n")
+        for path in client.sockets(os.environ.get("FIBER_RUNTIME_DIRECTORY")):
+            for line in _answers(path, request):
+                self.wfile.write(json.dumps(line).encode() + b"\n")
 
     def _question_size(self) -> int:
         size = int(self.headers.get("Content-Length", "none"))
@@ -535,6 +534,16 @@ class _Handler(BaseHTTPRequestHandler):
 
     def log_message(self, *_: object) -> None:
         """Write nothing: the log is the program's."""
+
+
+def _answers(path: str, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """Yield the lines of one program's answer, or that it does not answer."""
+    try:
+        yield from client.ask(path, request)
+    except client.Ended:
+        pass
+    except client.NoAnswer as error:
+        yield {"error": f"{error}: a native function may hold Python's lock"}
 
 
 def _pass_on_signals(launcher: ProgramLauncher) -> None:

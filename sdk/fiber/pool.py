@@ -27,6 +27,7 @@ from fiber import _logs
 from fiber._engine.chunks import default_chunksize
 from fiber._exceptions import report_uncaught
 from fiber._runtime import options, start_methods
+from fiber._runtime import progress as reports
 from fiber._runtime.executor import PoolExecutor
 from fiber._runtime.options import PoolOptions
 from fiber._runtime.state import runtime
@@ -222,14 +223,18 @@ class Pool:
         chunksize: int | None = None,
         *,
         timeout: float | None = None,
+        progress: bool | str = False,
     ) -> list[_T]:
         """Return ``[func(x) for x in iterable]``; workers run the calls.
 
         ``chunksize`` consecutive items go to one worker together.  By default it adapts to the
         duration of the tasks.  An iterator is read as fast as its tasks run.  ``timeout``, as in
         ``apply``, is for each single task.
+
+        ``progress=True`` shows the progress on the standard error stream, and a text names it: by a
+        bar of tqdm or rich in a terminal or notebook, by a line every ten seconds elsewhere.
         """
-        return self._map(work.MAP, func, iterable, chunksize, timeout)
+        return self._map(work.MAP, func, iterable, chunksize, timeout, progress)
 
     def starmap(
         self,
@@ -238,9 +243,10 @@ class Pool:
         chunksize: int | None = None,
         *,
         timeout: float | None = None,
+        progress: bool | str = False,
     ) -> list[_T]:
         """Return ``[func(*x) for x in iterable]``, otherwise as ``map``."""
-        return self._map(work.STAR, func, iterable, chunksize, timeout)
+        return self._map(work.STAR, func, iterable, chunksize, timeout, progress)
 
     def map_async(
         self,
@@ -251,6 +257,7 @@ class Pool:
         error_callback: _ErrorCallback | None = None,
         *,
         timeout: float | None = None,
+        progress: bool | str = False,
     ) -> MapResult[_T]:
         """Call as ``map`` does, but return a result once ``iterable`` is read.
 
@@ -261,7 +268,7 @@ class Pool:
         ``apply_async``.
         """
         result = MapResult(self, callback, error_callback)
-        self._map_async(work.MAP, func, iterable, chunksize, timeout, result)
+        self._map_async(work.MAP, func, iterable, chunksize, timeout, progress, result)
         return result
 
     def starmap_async(
@@ -273,10 +280,11 @@ class Pool:
         error_callback: _ErrorCallback | None = None,
         *,
         timeout: float | None = None,
+        progress: bool | str = False,
     ) -> MapResult[_T]:
         """Call as ``starmap`` does, but return at once with a result to wait for."""
         result = MapResult(self, callback, error_callback)
-        self._map_async(work.STAR, func, iterable, chunksize, timeout, result)
+        self._map_async(work.STAR, func, iterable, chunksize, timeout, progress, result)
         return result
 
     def imap(
@@ -287,6 +295,7 @@ class Pool:
         *,
         timeout: float | None = None,
         buffersize: int | None = None,
+        progress: bool | str = False,
     ) -> IMapIterator[_T]:
         """Return an iterator over the results of ``func(x) for x in iterable``, in order.
 
@@ -295,7 +304,7 @@ class Pool:
         ``map``.
         """
         iterator: IMapIterator[_T] = IMapIterator(self)
-        return self._imap(iterator, func, iterable, chunksize, timeout, buffersize)
+        return self._imap(iterator, func, iterable, chunksize, timeout, buffersize, progress)
 
     def imap_unordered(
         self,
@@ -305,10 +314,11 @@ class Pool:
         *,
         timeout: float | None = None,
         buffersize: int | None = None,
+        progress: bool | str = False,
     ) -> IMapIterator[_T]:
         """Call as ``imap`` does, and yield results in the order in which they come."""
         iterator: IMapIterator[_T] = IMapUnorderedIterator(self)
-        return self._imap(iterator, func, iterable, chunksize, timeout, buffersize)
+        return self._imap(iterator, func, iterable, chunksize, timeout, buffersize, progress)
 
     # How calls and maps are done
 
@@ -319,10 +329,11 @@ class Pool:
         iterable: Iterable[Any],
         chunksize: int | None,
         timeout: float | None,
+        progress: bool | str,
     ) -> list[_T]:
         self._check_may_wait()
         result: MapResult[_T] = MapResult(self)
-        item = self._item(kind, func, result, chunksize, timeout)
+        item = self._item(kind, func, result, chunksize, timeout, progress, iterable)
         if item is not None:
             try:
                 if isinstance(iterable, (*SLICEABLE, list)) or self._maxtasksperchild is not None:
@@ -335,6 +346,9 @@ class Pool:
             except BaseException:  # Ctrl-C: no caller waits for the rest
                 self._executor.cancel(item)
                 raise
+            finally:
+                if progress:
+                    reports.reporter.finish(item)
         return result.get()
 
     def _map_async(
@@ -344,9 +358,10 @@ class Pool:
         iterable: Iterable[Any],
         chunksize: int | None,
         timeout: float | None,
+        progress: bool | str,
         result: MapResult[_T],
     ) -> None:
-        item = self._item(kind, func, result, chunksize, timeout)
+        item = self._item(kind, func, result, chunksize, timeout, progress, iterable)
         if item is not None:
             self._submit(item, iterable, chunksize)
 
@@ -358,10 +373,11 @@ class Pool:
         chunksize: int,
         timeout: float | None,
         buffersize: int | None,
+        progress: bool | str,
     ) -> IMapIterator[_T]:
         buffersize = options.buffersize(buffersize)
         chunksize = options.chunksize(chunksize)
-        item = self._item(work.MAP, func, iterator._buffer, chunksize, timeout)
+        item = self._item(work.MAP, func, iterator._buffer, chunksize, timeout, progress, iterable)
         if item is not None:
             iterator._begin(self._executor, item, iterable, buffersize)
         return iterator
@@ -373,6 +389,8 @@ class Pool:
         future: Any,
         chunksize: int | None,
         timeout: float | None,
+        progress: bool | str,
+        iterable: Iterable[Any],
     ) -> WorkItem | None:
         """Return the work item of a map.
 
@@ -386,7 +404,8 @@ class Pool:
         except Exception as error:
             self._executor.reject(future, error)
             return None
-        return WorkItem(
+        label = options.label(progress, function.name)
+        item = WorkItem(
             kind,
             function=function,
             future=future,
@@ -394,6 +413,9 @@ class Pool:
             eager=chunksize == 1,
             timeout=limit,
         )
+        if label:
+            reports.reporter.show(item, label, iterable, self._executor.workers.busy)
+        return item
 
     def _submit(self, item: WorkItem, iterable: Iterable[Any], chunksize: int | None) -> None:
         try:

@@ -155,7 +155,6 @@ def test_what_a_worker_said_before_it_died_is_in_the_log_of_its_program(
         terminal.shows("the worker says its last words")
         pod = person.scene.wait("its pod is ready", lambda: worker(person))
         assert pod is not None
-        name = pod["metadata"]["name"]
         cluster.kill(pod, names.WORKER_CONTAINER)
         terminal.shows("the worker says its last words")  # another one, whose turn it is
         (line, _) = [
@@ -163,8 +162,6 @@ def test_what_a_worker_said_before_it_died_is_in_the_log_of_its_program(
             for line in person.runs("logs", "mine").stdout.splitlines()
             if "the worker says its last words" in line
         ]
-        assert name in line
-        again = person.runs("logs", "mine", "--worker", name)
-        assert again.returncode == 0, again.stderr  # the pod that died is kept
+        assert pod["metadata"]["name"] in line
         person.runs("stop", "mine", "--now")
     has_no_program(person)

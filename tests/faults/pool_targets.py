@@ -13,6 +13,8 @@ import time
 from pathlib import Path
 from typing import NoReturn
 
+from fiber._agent import last_words
+
 
 def die(_number: int = 0) -> NoReturn:
     print("about to die", file=sys.stderr, flush=True)
@@ -61,6 +63,49 @@ def hang_in_python() -> NoReturn:
     start_beside()
     while True:
         pass
+
+
+def run_another_program() -> NoReturn:
+    os.execvp("sleep", ["sleep", "600"])
+
+
+def close_all_and_open(path: str) -> NoReturn:
+    """Close all descriptors, and open one file again and again, so that it has their numbers."""
+    os.closerange(3, 256)
+    for _ in range(3, 256):
+        os.open(path, os.O_WRONLY | os.O_CREAT)
+    Path(path + ".ready").touch()
+    while True:
+        time.sleep(600)
+
+
+def run_threads_while_shown(times: int) -> int:
+    """Get SHOW some times while other threads run, and end these."""
+    end = threading.Event()
+    others = [threading.Thread(target=recurse_until, args=(end,)) for _ in range(2)]
+    for thread in others:
+        thread.start()
+    shower = threading.Thread(target=show_stacks, args=(times,))
+    shower.start()
+    shower.join()
+    end.set()
+    for thread in others:
+        thread.join()
+    return times
+
+
+def recurse_until(end: threading.Event) -> None:
+    def down(depth: int) -> int:
+        return down(depth - 1) if depth else 0
+
+    while not end.is_set():
+        down(800)
+
+
+def show_stacks(times: int) -> None:
+    for _ in range(times):
+        os.kill(os.getpid(), last_words.SHOW)
+        time.sleep(0)
 
 
 def hang_with(_: object) -> NoReturn:

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ import pytest
 
 from census import wait_until
 from faults.program import Program
+from fiber._monitor import client
 from patience import PATIENCE
 from unit.pool_command_rig import run
 
@@ -28,6 +30,20 @@ if __name__ == "__main__":
     fiber.Process(target=hang, name="Simulator", daemon=True).start()
     print("begun", flush=True)
     hang()
+"""
+
+
+_SCRIPT_WITH_TWO_RUNTIMES = """
+import fiber
+from fiber._runtime.state import shutdown
+
+if __name__ == "__main__":
+    for _ in range(2):
+        process = fiber.Process(target=print, args=("begun",))
+        process.start()
+        process.join()
+        input()
+        shutdown()
 """
 
 
@@ -70,6 +86,33 @@ def test_a_program_is_listed(program: Program) -> None:
     assert row["command"].endswith(str(program.script))
     assert row["created"].endswith("Z")
     assert name_of(program) in run("ps").out
+
+
+def test_a_program_is_listed_although_the_cluster_does_not_answer(
+    program: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "config").write_text("nonsense")
+    monkeypatch.setenv("KUBECONFIG", str(tmp_path / "config"))
+    outcome = run("ps")
+    assert outcome.status == 4
+    assert name_of(program) in outcome.out
+    assert "cannot connect to a cluster" in outcome.err
+
+
+def test_a_program_is_listed_again_after_its_runtime_has_ended() -> None:
+    program = Program(_SCRIPT_WITH_TWO_RUNTIMES, stdin=subprocess.PIPE)
+    stdin = program.process.stdin
+    assert stdin is not None
+    try:
+        for _ in range(2):
+            assert program.line() == "begun"
+            (row,) = json.loads(run("ps", "--output", "json").out)
+            assert (row["state"], row["pid"]) == ("running", program.pid)
+            stdin.write(b"\n")
+            stdin.flush()
+    finally:
+        program.close()
+        stdin.close()
 
 
 def test_no_program_is_listed_without_an_error() -> None:
@@ -171,3 +214,38 @@ def test_a_program_whose_output_is_no_file_has_no_log(program: Program) -> None:
     assert outcome.status == 1
     assert f"there is no log of {name_of(program)!r}" in outcome.err
     assert "its output goes to pipe:" in outcome.err
+
+
+def test_programs_are_asked_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    both = threading.Barrier(2, timeout=PATIENCE)
+
+    def silent(path: str) -> None:
+        both.wait()
+
+    monkeypatch.setattr(client, "sockets", lambda _: ["first", "second"])
+    monkeypatch.setattr("fiber._cli.local._program", silent)
+    assert run("ps").err == "no program runs on this machine\n"
+
+
+def test_a_worker_of_one_of_a_pods_programs_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    stack = {"name": "Simulator", "pid": 7, "text": "here"}
+    lines = [{"unknown": "Simulator", "names": ["Other"]}, {"stack": stack}]
+    monkeypatch.setattr("fiber._cli.stack.answer_of", lambda *_: iter(lines))
+    assert run("stack", "train", "--worker", "Simulator") == (0, "Simulator (pid 7)\nhere\n\n", "")
+
+
+def test_one_program_that_does_not_answer_hides_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    lines = [{"error": "silent"}, {"stack": {"name": "program", "text": "here"}}]
+    monkeypatch.setattr("fiber._cli.stack.answer_of", lambda *_: iter(lines))
+    outcome = run("stack", "train")
+    assert "here" in outcome.out
+    assert "silent" in outcome.err
+
+
+def test_no_cluster_is_asked_without_the_package_for_it(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "config").touch()
+    monkeypatch.setenv("KUBECONFIG", str(tmp_path / "config"))
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert run("ps") == (0, "", "no program runs on this machine\n")

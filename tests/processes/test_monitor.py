@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -44,9 +45,55 @@ def test_a_worker_that_hangs_in_native_code_shows_its_stack_and_goes_on(pool: Po
     (worker,) = pool.workers()
     assert wait_until(lambda: " in hang_in_native_code" in stack_of(worker.name), PATIENCE)
     text = stack_of(str(worker.pid))
-    assert " in wait_beside" in text
+    assert text.startswith("Main thread, in native code (most recent call first):")
     assert "worker.py" not in text
     assert [info.pid for info in pool.workers()] == [worker.pid]
+
+
+def test_a_worker_whose_threads_run_goes_on(pool: Pool) -> None:
+    # faulthandler crashes on the frames of threads that run.
+    assert pool.apply(tasks.run_threads_while_shown, (100,)) == 100
+
+
+@pytest.fixture
+def begin() -> Iterator[Callable[..., fiber.Process]]:
+    """Starts a process that is killed at the end."""
+    started = []
+
+    def begin(target: Callable[..., Any], *args: Any) -> fiber.Process:
+        process = fiber.Process(target=target, args=args, name="target")
+        process.start()
+        started.append(process)
+        return process
+
+    yield begin
+    for process in started:
+        process.kill()
+        process.join()
+        process.close()
+
+
+def test_a_child_that_runs_another_program_goes_on(begin: Callable[..., fiber.Process]) -> None:
+    process = begin(tasks.run_another_program)
+
+    def runs_it() -> bool:
+        with open(f"/proc/{process.pid}/comm") as file:
+            return file.read() == "sleep\n"
+
+    assert wait_until(lambda: process.pid is not None and runs_it(), PATIENCE)
+    assert "runs another program" in stack_of("target")
+    assert process.is_alive()
+
+
+def test_no_stack_is_written_into_a_file_of_the_user(
+    begin: Callable[..., fiber.Process], tmp_path: Path
+) -> None:
+    path = tmp_path / "data"
+    process = begin(tasks.close_all_and_open, str(path))
+    assert wait_until((tmp_path / "data.ready").exists, PATIENCE)
+    assert "has closed the file for its stacks" in stack_of("target")
+    assert path.read_bytes() == b""
+    assert process.is_alive()
 
 
 def test_an_idle_worker_shows_that_it_waits(pool: Pool) -> None:

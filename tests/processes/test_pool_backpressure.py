@@ -85,7 +85,7 @@ def test_results_can_all_be_read_after_the_pool_is_joined(pool: Pool) -> None:
 @pytest.mark.parametrize("bounds", [{}, {"buffersize": 5}], ids=["no bound", "buffersize"])
 @pytest.mark.parametrize("dropped", ["when done", "before"])
 def test_results_are_freed_when_their_iterator_is_dropped(
-    bounds: dict[str, int], dropped: str
+    bounds: dict[str, Any], dropped: str
 ) -> None:
     with fiber.Pool(1) as pool:
         gc.collect()

@@ -68,6 +68,8 @@ def test_bad_arguments_are_named(pool: Pool) -> None:
                 call(tasks.square, range(3), size)
         with pytest.raises(TypeError, match=r"timeout must be a number of seconds .* '2'"):
             call(tasks.square, range(3), timeout="2")
+        with pytest.raises(TypeError, match="progress must be True, False or a text, not 1"):
+            call(tasks.square, range(3), progress=1)
     with pytest.raises(TypeError, match="chunksize"):
         pool.imap(tasks.square, range(3), cast("Any", None))
     with pytest.raises(TypeError, match="buffersize"):

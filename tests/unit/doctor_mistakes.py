@@ -247,7 +247,7 @@ MISTAKES = [
         lambda rig: rig.cluster.end_operator(),
         "operator",
         "no operator serves",
-        "helm install",
+        "the chart's value namespaces",
     ),
     Mistake(
         "stale Lease",

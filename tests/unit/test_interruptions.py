@@ -424,8 +424,13 @@ def test_an_interrupted_start_leaves_no_passed_descriptor(
 ) -> None:
     site = state.runtime()
     monkeypatch.setattr(Agent, "child", lambda _agent, spec, _observer: spec)
-    owner: Any = SimpleNamespace(begin=lambda _spec: None)
+    events = ("started", "received", "recalled", "draining")
+    owner: Any = SimpleNamespace(begin=lambda _: forget(), **dict.fromkeys(events))
     process = fiber.Process(target=print, args=pipe)
+
+    def forget() -> None:
+        for child in site.children:
+            site.children.remove(child)
 
     def begin() -> None:
         site.start(process, owner)

@@ -16,10 +16,13 @@ import tarfile
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from faults.program import wait_for
+from fiber import launcher
+from fiber._monitor import client
 from fiber.launcher import (
     ALIVE,
     DROPPED,
@@ -483,7 +486,8 @@ import os
 from fiber._monitor.server import MonitorServer
 from fiber._transport.loop import Loop
 
-folder = os.environ["TMPDIR"] + "/fiber-watched"
+parent = os.environ.get("FIBER_RUNTIME_DIRECTORY") or os.environ["TMPDIR"]
+folder = parent + "/fiber-watched"
 os.mkdir(folder, 0o700)
 loop = Loop()
 server = MonitorServer(loop, folder, lambda request: [{"answer": request}])
@@ -492,16 +496,28 @@ loop.run()
 """
 
 
+@pytest.mark.parametrize("variable", ["TMPDIR", "FIBER_RUNTIME_DIRECTORY"])
 def test_a_question_is_passed_on_to_the_programs_monitor(
-    site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, variable: str
 ) -> None:
-    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setenv(variable, str(tmp_path))
     pod = site.python(WATCHED)
     pod.read(until=b"listens")
     question = {"Content_Length": "16"}
     with pod.ask("POST", "/monitor", b'{"ask": "stack"}', **question) as response:
         answers = [json.loads(line) for line in response]
     assert {"answer": {"ask": "stack"}} in answers
+
+
+def test_a_program_that_does_not_answer_the_launcher_is_named_so(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def silent(*_: object) -> Iterator[dict[str, Any]]:
+        raise client.NoAnswer("the program does not answer within 10 s")
+
+    monkeypatch.setattr(client, "ask", silent)
+    (line,) = launcher._answers("path", {})
+    assert line["error"].startswith("the program does not answer within 10 s")
 
 
 @pytest.mark.parametrize("size", ["70000", "-1", "many"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import socket
 import threading
@@ -12,6 +13,7 @@ from typing import Any
 import pytest
 
 from census import wait_until
+from fiber._hub.directory import HUB_SOCKET
 from fiber._monitor import client, server
 from fiber._monitor.server import MonitorServer
 from fiber._transport.loop import Loop
@@ -30,6 +32,11 @@ def listening(loop: Loop, folder: Path) -> Iterator[str]:
     """The socket of a server that repeats the request."""
     made = MonitorServer(loop, str(folder), lambda request: [request])
     yield str(folder / server.SOCKET)
+    close(loop, made)
+
+
+def close(loop: Loop, made: MonitorServer) -> None:
+    """Close a server whose loop goes on."""
     loop.call_soon(loop.unregister, made._listener.fileno())
     settled = threading.Event()
     loop.call_soon(settled.set)
@@ -80,13 +87,73 @@ def test_no_more_than_some_clients_are_served(
 
 def test_the_files_of_a_killed_program_are_removed(folder: Path) -> None:
     path = folder / server.SOCKET
-    with socket.socket(socket.AF_UNIX) as sock:
-        sock.bind(str(path))
+    for left in (path, folder / HUB_SOCKET):
+        with socket.socket(socket.AF_UNIX) as sock:
+            sock.bind(str(left))
     assert client.sockets(str(folder.parent)) == [str(path)]
     assert client.pid_of(str(path)) is None
     with pytest.raises(client.NoAnswer, match="the program has ended"):
         list(client.ask(str(path), {}))
     assert client.sockets(str(folder.parent)) == []
+
+
+def test_a_folder_that_is_not_fibers_is_kept(folder: Path) -> None:
+    path, data = folder / server.SOCKET, folder / "data"
+    data.touch()
+    with socket.socket(socket.AF_UNIX) as sock:
+        sock.bind(str(path))
+    with pytest.raises(client.NoAnswer):
+        list(client.ask(str(path), {}))
+    assert data.exists()
+    path.unlink()
+    path.touch()
+    assert client.sockets(str(folder.parent)) == []
+
+
+def test_a_socket_has_its_name_once_it_listens(
+    loop: Loop, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = []
+
+    class Listener(socket.socket):
+        def listen(self, *args: int) -> None:
+            seen.append(client.sockets(str(folder.parent)))
+            super().listen(*args)
+
+    monkeypatch.setattr(socket, "socket", Listener)
+    made = MonitorServer(loop, str(folder), lambda request: [request])
+    assert seen == [[]]
+    assert client.sockets(str(folder.parent)) == [str(folder / server.SOCKET)]
+    close(loop, made)
+
+
+def test_without_a_descriptor_the_loop_does_not_spin(
+    listening: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refusals = [OSError(errno.EMFILE, "too many open files")]
+    accept = socket.socket.accept
+
+    def refuse_once(sock: socket.socket) -> Any:
+        if refusals:
+            raise refusals.pop()
+        return accept(sock)
+
+    monkeypatch.setattr(socket.socket, "accept", refuse_once)
+    with monkeypatch.context() as patch:
+        patch.setattr(server, "_ACCEPT_AGAIN", 3600.0)
+        with pytest.raises(client.NoAnswer, match="does not answer"):
+            list(client.ask(listening, {}, patience=0.05))
+    assert refusals == []
+
+
+def test_a_program_for_which_too_many_wait_has_not_ended(folder: Path) -> None:
+    path = folder / server.SOCKET
+    with socket.socket(socket.AF_UNIX) as sock, socket.socket(socket.AF_UNIX) as first:
+        sock.bind(str(path))
+        sock.listen(0)
+        first.connect(str(path))
+        with pytest.raises(client.NoAnswer, match="does not answer"):
+            list(client.ask(str(path), {}))
 
 
 def test_a_program_that_does_not_answer_is_given_up(folder: Path) -> None:

@@ -193,6 +193,8 @@ class Agent:
     def _on_reply_about_abandoned(self, link: ZygoteLink, reply: tuple[Any, ...]) -> None:
         if reply[0] == zygote.STARTED:
             link.send(zygote.SIGNAL, reply[1], signal.SIGKILL)
+        elif reply[0] == zygote.STACK:
+            return
         elif (slot := self._abandoned.pop(reply[1], None)) is not None:
             self.progress_table.release(slot)  # the child can no longer write to the slot
 

@@ -1,8 +1,12 @@
 """Reasons for the death of a child: its Python stacks, its running task, the memory limit.
 
 The zygote makes a memory file for each child.  faulthandler writes the stacks of all threads there,
-also at a crash in native code, and the zygote reads them when the child is gone.  SHOW asks a child
-that lives on for its stacks.
+also at a crash in native code, and the zygote reads them when the child is gone.
+
+SHOW asks a child that lives on for its stacks.  Its handler is Python code, so that Python's lock
+is held: faulthandler crashes if it walks the frames of a thread that runs.  A child that does not
+answer hangs in native code.  It gets SHOW_NATIVE, whose handler shows only the thread that it
+interrupts.
 
 The progress table is shared memory in which each pool worker notes its running task.  A note costs
 a store into memory.  When a worker dies, its agent reads here which task to blame.
@@ -24,13 +28,16 @@ TELL = signal.SIGRTMAX - 3
 """Signal to a child: write the stacks, then die."""
 
 SHOW = signal.SIGRTMAX - 4
-"""Signal to a child: write the stacks, and go on."""
+"""Signal to a child: write the stacks of all threads between two steps of Python, and go on."""
+
+SHOW_NATIVE = signal.SIGRTMAX - 5
+"""Signal to a child: write the stack of the main thread at once, and go on."""
 
 GRACE = 0.5
 """Seconds from TELL to SIGKILL."""
 
 LIMIT = 1 << 14
-"""Bytes of the stacks that the zygote keeps."""
+"""Characters of the stacks that the zygote keeps."""
 
 _HERE = os.path.dirname(os.path.abspath(__file__))
 
@@ -43,6 +50,9 @@ _OUR_FRAMES = tuple(
 )
 """Starts of the lines of a stack that show Fiber's frames around the code of the user."""
 
+_HANDLER = f'  File "{os.path.join(_HERE, os.path.basename(__file__))}"'
+"""Start of the line of the handler of SHOW."""
+
 
 def make_file() -> int:
     """Return the descriptor of a new memory file, or -1 if the system has no room for one."""
@@ -52,7 +62,7 @@ def make_file() -> int:
 
 
 def write_to(fd: int) -> None:
-    """Have faulthandler write to ``fd`` on TELL and SHOW, and on crashes.
+    """Have faulthandler write to ``fd`` on TELL, SHOW and SHOW_NATIVE, and on crashes.
 
     Crashes stay the user's if the user enabled faulthandler.
     """
@@ -61,17 +71,30 @@ def write_to(fd: int) -> None:
     with suppress(OSError, RuntimeError, ValueError):  # stacks are optional
         signal.signal(TELL, signal.SIG_DFL)
         faulthandler.register(TELL, file=fd, all_threads=True, chain=True)
-        faulthandler.register(SHOW, file=fd, all_threads=True)
+        signal.signal(SHOW, lambda *_: faulthandler.dump_traceback(fd, all_threads=True))
+        faulthandler.register(SHOW_NATIVE, file=fd, all_threads=False)
         if not faulthandler.is_enabled():
             faulthandler.enable(file=fd, all_threads=True)
 
 
-def read(fd: int) -> str:
-    """Return what a child has written, and close its file."""
+def read(fd: int, *, told: bool) -> str:
+    """Return what a child has written about its death, and close its file.
+
+    ``told``: the child got TELL.  Else only a crash counts: other stacks are late answers to SHOW.
+    """
     try:
-        return _text_in(fd)
+        data = _data_in(fd)
     finally:
         os.close(fd)
+    begin = 0 if told else data.rfind(_CRASH)
+    return _text_of(data[begin:]) if begin >= 0 else ""
+
+
+_ONE_THREAD = "Stack"
+"""Start of what faulthandler writes on SHOW_NATIVE."""
+
+_CRASH = b"Fatal Python error: "
+"""Start of what faulthandler writes at a crash."""
 
 
 class StackRequest:
@@ -85,40 +108,98 @@ class StackRequest:
     """Seconds between two looks."""
 
     def __init__(self, pid: int, fd: int, now: float) -> None:
+        """Ask the child."""
         self.due = now + self.INTERVAL
         """Time of the next look."""
         self._pid = pid
         self._fd = fd
+        self._native_at = now + _PYTHON_PATIENCE
         self._deadline = now + _PATIENCE
         self._size = 0
-        _empty(fd)
+        empty(fd)
+        self._refusal = self._ask(SHOW)
 
     def look(self, now: float) -> str | None:
         """Return the stacks, or why there are none; None: look again when it is ``due``."""
         before, self._size = self._size, os.fstat(self._fd).st_size
         if self._size and self._size == before:
-            text = _text_in(self._fd)
-            _empty(self._fd)
-            return text if _has_user_code(text) else "Only Fiber's code runs: it waits for work."
+            return self._shown()
+        if self._refusal:
+            return f"No stack: the process {self._refusal}."
         if now >= self._deadline:
             return f"No stack came within {_PATIENCE:.0f} s: the process {_activity(self._pid)}."
+        if now >= self._native_at and not self._size:
+            self._native_at = self._deadline
+            self._refusal = self._ask(SHOW_NATIVE)
         self.due = now + self.INTERVAL
         return None
+
+    def _shown(self) -> str:
+        text = _text_of(_data_in(self._fd))
+        empty(self._fd)
+        return text if _has_user_code(text) else "Only Fiber's code runs: it waits for work."
+
+    def _ask(self, signum: int) -> str:
+        """Send a signal to the child, or return why that would do harm."""
+        refusal = _refusal(self._pid, signum, self._fd)
+        if not refusal:
+            with suppress(PermissionError):  # the child runs a set-user-ID program
+                os.kill(self._pid, signum)
+        return refusal
 
 
 _PATIENCE = 3.0
 """Seconds in which a child writes its stacks."""
 
+_PYTHON_PATIENCE = 0.5
+"""Seconds in which a child that runs Python code writes its stacks."""
+
+
+def _refusal(pid: int, signum: int, fd: int) -> str:
+    """Return why a signal would end a child, or write into a file of the user; empty if not."""
+    try:
+        caught, _, ignored = signal_masks(pid)
+    except (OSError, KeyError, ValueError):
+        return "cannot be inspected"
+    if _state(pid) != "Z" and not (caught | ignored) >> (signum - 1) & 1:
+        return "runs another program, or it has reset the handler of Fiber's signal"
+    if not _has_open(pid, fd):
+        return "has closed the file for its stacks"
+    return ""
+
+
+def _has_open(pid: int, fd: int) -> bool:
+    """Return whether the child's descriptor ``fd`` still is the file that it is here."""
+    try:
+        return os.path.samestat(os.stat(f"/proc/{pid}/fd/{fd}"), os.fstat(fd))
+    except FileNotFoundError:
+        return False
+    except OSError:  # the child has changed its user: only the system's administrator may look
+        return True
+
+
+def signal_masks(pid: int) -> tuple[int, int, int]:
+    """Return the signals that a process catches, blocks and ignores; OSError, KeyError, ValueError.
+
+    The lowest bit is signal 1.
+    """
+    with open(f"/proc/{pid}/status") as status:
+        lines = dict(line.split(":", 1) for line in status)
+    return int(lines["SigCgt"], 16), int(lines["SigBlk"], 16), int(lines["SigIgn"], 16)
+
+
+def _state(pid: int) -> str:
+    return _read(f"/proc/{pid}/stat").rpartition(")")[2].strip()[:1]
+
 
 def _activity(pid: int) -> str:
     """Return what the kernel says that a process does."""
-    state = _read(f"/proc/{pid}/stat").rpartition(")")[2].strip()[:1]
     return {
         "D": "waits for a device or a network file system",
         "T": "is stopped by a signal",
         "t": "is stopped by a debugger",
         "Z": "has ended",
-    }.get(state, "still starts, or it has changed the handler of Fiber's signal")
+    }.get(_state(pid), "still starts, or it has changed the handler of Fiber's signal")
 
 
 def _has_user_code(stacks: str) -> bool:
@@ -126,21 +207,41 @@ def _has_user_code(stacks: str) -> bool:
     return not all(frame.startswith(_PACKAGE) for frame in frames)
 
 
-def _empty(fd: int) -> None:
+def empty(fd: int) -> None:
+    """Drop what a child has written.  The child and this process write at the same position."""
     os.ftruncate(fd, 0)
-    os.lseek(fd, 0, os.SEEK_SET)  # the child writes at the same position
+    os.lseek(fd, 0, os.SEEK_SET)
 
 
-def _text_in(fd: int) -> str:
-    """Return the stacks in a file, without Fiber's frames."""
+def _data_in(fd: int) -> bytes:
     try:
-        data = os.pread(fd, LIMIT + 1, 0)
+        return os.pread(fd, os.fstat(fd).st_size, 0)
     except OSError:
-        return ""
-    lines = _without_our_frames(data[:LIMIT].decode(errors="replace").splitlines())
-    if len(data) > LIMIT:
-        lines[-1:] = ["..."]
-    return "\n".join(lines).strip()
+        return b""
+
+
+def _text_of(data: bytes) -> str:
+    """Return stacks without Fiber's frames, that of the current thread first."""
+    lines = _without_our_frames(data.decode(errors="replace").splitlines())
+    text = _current_thread_first("\n".join(lines).strip())
+    if text.startswith(_ONE_THREAD):
+        text = f"Main thread, in native code{text.removeprefix(_ONE_THREAD)}"
+    if len(text) <= LIMIT:
+        return text
+    return text[:LIMIT].rpartition("\n")[0] + "\n..."
+
+
+def _current_thread_first(text: str) -> str:
+    """Move the stack of the thread that runs the task to the front.
+
+    faulthandler writes it last, where it would be cut off.
+    """
+    head, found, rest = text.partition("Current thread ")
+    current, _, others = (found + rest).partition("\n\n")
+    title = ""
+    if head.startswith(_CRASH.decode()):
+        title, _, head = head.partition("\n\n")
+    return "\n\n".join(part.strip() for part in (title, current, head, others) if part.strip())
 
 
 def _without_our_frames(lines: Iterable[str]) -> list[str]:
@@ -148,6 +249,8 @@ def _without_our_frames(lines: Iterable[str]) -> list[str]:
     kept = []
     ours = False
     for line in lines:
+        if line.startswith(_HANDLER):
+            continue
         ours = line.startswith("  ") and (ours or line.startswith(_OUR_FRAMES))
         if not ours and not line.startswith("Extension modules:"):
             kept.append(line)

@@ -19,7 +19,7 @@ from typing import Any
 from fiber import config
 from fiber._agent.agent import Agent, LocalChild
 from fiber._agent.interface import Cause, ChildSpec, ExitReport
-from fiber._agent.last_words import TELL
+from fiber._agent.last_words import TELL, signal_masks
 from fiber._hub.hub import Hub
 from fiber._transport.channels import naming_the_limit
 from fiber._transport.link import Link
@@ -451,9 +451,7 @@ def is_expected(pid: int, signum: int) -> bool:
     that still has its zygote's handlers, recognized by TELL, which zygotes ignore.
     """
     try:
-        with open(f"/proc/{pid}/status") as status:
-            lines = dict(line.split(":", 1) for line in status)
-        caught, blocked, ignored = (int(lines[name], 16) for name in ("SigCgt", "SigBlk", "SigIgn"))
+        caught, blocked, ignored = signal_masks(pid)
     except (OSError, KeyError, ValueError):
         return False
     if ignored >> (TELL - 1) & 1:

@@ -131,9 +131,10 @@ class Zygote:
         # A terminal with `stty tostop` stops background process groups that print.
         signal.signal(signal.SIGTTOU, signal.SIG_IGN)
         # A new child ignores TELL until ``_run_child`` has reset its signal handlers.  It ignores
-        # SHOW until faulthandler handles it.
+        # SHOW and SHOW_NATIVE until it handles them.
         signal.signal(last_words.TELL, signal.SIG_IGN)
         signal.signal(last_words.SHOW, signal.SIG_IGN)
+        signal.signal(last_words.SHOW_NATIVE, signal.SIG_IGN)
         signal.signal(signal.SIGCHLD, lambda *_: None)
         signal.set_wakeup_fd(self._sigchld_in, warn_on_full_buffer=False)
 
@@ -241,23 +242,31 @@ class Zygote:
 
     def _signal(self, child: int, signum: int) -> None:
         pid = self._pids.get(child)
-        if pid is None or (signum == last_words.SHOW and not self._request_stack(pid)):
+        if signum == last_words.SHOW:
+            self._request_stack(child, pid)
+            return
+        if pid is None:
             return
         if signum == last_words.TELL:
-            self._overdue[pid] = time.monotonic() + last_words.GRACE
+            self._tell(pid)
         _kill(pid, signum)
 
-    def _request_stack(self, pid: int) -> bool:
-        """Note that a child is asked for its stacks; return False if it was asked before."""
-        words = self._words.get(pid, -1)
-        if words < 0:
-            self._reply(
-                STACK, self._children[pid], "No stack: the system had no room for its file."
-            )
+    def _tell(self, pid: int) -> None:
+        """Prepare the death of a child by TELL."""
+        if pid not in self._overdue and pid in self._words:
+            self._requests.pop(pid, None)  # the answer is the child's end
+            last_words.empty(self._words[pid])
+        self._overdue[pid] = time.monotonic() + last_words.GRACE
+
+    def _request_stack(self, child: int, pid: int | None) -> None:
+        """Ask a child for its stacks, unless it was asked before or is about to die."""
+        words = -1 if pid is None else self._words.get(pid, -1)
+        if pid is None or pid in self._overdue:
+            self._reply(STACK, child, "No stack: it has not started, or it is about to end.")
+        elif words < 0:
+            self._reply(STACK, child, "No stack: the system had no room for its file.")
         elif pid not in self._requests:
             self._requests[pid] = last_words.StackRequest(pid, words, time.monotonic())
-            return True
-        return False
 
     def _answer_requests(self) -> None:
         now = time.monotonic()
@@ -297,10 +306,11 @@ class Zygote:
         self._pids.pop(child, None)
         self._requests.pop(pid, None)
         exitcode = os.waitstatus_to_exitcode(status)
-        if self._overdue.pop(pid, None) is not None and exitcode == -last_words.TELL:
+        told = self._overdue.pop(pid, None) is not None
+        if told and exitcode == -last_words.TELL:
             exitcode = -signal.SIGKILL  # TELL is how the agent begins to kill it
         words = self._words.pop(pid, -1)
-        stack = last_words.read(words) if words >= 0 else ""
+        stack = last_words.read(words, told=told) if words >= 0 else ""
         self._reply(EXITED, child, exitcode, *([stack] if stack else []))
 
     def _reply(self, *answer: Any) -> None:

@@ -255,7 +255,7 @@ def _operator(facts: Facts) -> Iterator[Verdict]:
             "no operator serves this namespace",
             f"there is no sign of one: the Lease {SERVING_LEASE} {said}".replace(" it ", " "),
             f"install it: {INSTALL}. If one runs, let it serve this namespace (the chart's value "
-            "watchNamespaces)",
+            "namespaces)",
         )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import socket
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import click
@@ -17,6 +18,9 @@ from fiber._monitor import client
 
 _PATIENCE = 2.0
 """Seconds in which a program says who it is."""
+
+_MOST_THREADS = 64
+"""Programs that are asked at once.  Each that is stopped takes all its time."""
 
 
 class LocalProgram(NamedTuple):
@@ -54,7 +58,9 @@ def local_programs() -> list[LocalProgram]:
     """Return the programs of this machine, the oldest first."""
     with explained("read the configuration"):
         parent = config.load().runtime_directory
-    found = [program for path in client.sockets(parent) if (program := _program(path)) is not None]
+    paths = client.sockets(parent)
+    with ThreadPoolExecutor(max(1, min(len(paths), _MOST_THREADS))) as threads:
+        found = [program for program in threads.map(_program, paths) if program is not None]
     return sorted(found, key=lambda program: program.facts.get("started") or 0.0)
 
 

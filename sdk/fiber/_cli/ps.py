@@ -37,20 +37,23 @@ def command(namespace: str | None, context: str | None, output: str) -> None:
     """
     is_chosen = bool(context or namespace)
     rows = [] if is_chosen else [program.row() for program in local_programs()]
-    places, failure = [] if is_chosen else ["on this machine"], None
-    if is_chosen or Login.is_configured():
-        try:
+    places = [] if is_chosen else ["on this machine"]
+    try:
+        if is_chosen or Login.is_configured():
             session = connect(context, namespace)
             places.append(f"in {session.where}")
             rows += _of_namespace(session)
-        except CommandError as error:
-            failure = error
-    if rows or failure is None:
-        display.show(rows, _COLUMNS, output, f"no program runs {' or '.join(places)}")
+    except CommandError:  # the programs of this machine are known all the same
+        if rows:
+            _show(rows, output, places)
+        raise
+    _show(rows, output, places)
+
+
+def _show(rows: list[dict[str, Any]], output: str, places: list[str]) -> None:
+    display.show(rows, _COLUMNS, output, f"no program runs {' or '.join(places)}")
     if output == "table" and any(row["state"] == "running" and row["job"] for row in rows):
         click.echo("`fiber run --attach NAME` follows one again", err=True)
-    if failure is not None:
-        raise failure
 
 
 def _of_namespace(session: Session) -> list[dict[str, Any]]:

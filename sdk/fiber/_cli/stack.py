@@ -31,17 +31,32 @@ def command(
     """
     request = {"ask": "stacks", **({"worker": worker} if worker else {})}
     found = []
+    others = []
     for line in answer_of(name, request, context, namespace):
-        if "error" in line:
-            raise CommandError(f"cannot read the stacks of {name!r}", line["error"])
-        if "unknown" in line:
-            raise not_found("worker", str(worker), line["names"], f"the program {name!r}")
-        if "stack" in line and output == "json":
-            found.append(line["stack"])
-        elif "stack" in line:
+        if "stack" not in line:
+            others.append(line)
+            continue
+        found.append(line["stack"])
+        if output == "table":
             click.echo(_text(line["stack"]))
+    _raise_problem(name, worker, others, any_stack=bool(found))
     if output == "json":
         click.echo(json.dumps(found, indent=2))
+
+
+def _raise_problem(
+    name: str, worker: str | None, lines: list[dict[str, Any]], *, any_stack: bool
+) -> None:
+    """Raise the first error of the programs, of which a pod may have several.
+
+    That one program has no such worker is no error if another has one.
+    """
+    for line in lines:
+        if "error" in line:
+            raise CommandError(f"cannot read the stacks of {name!r}", line["error"])
+    names = [each for line in lines if "unknown" in line for each in line["names"]]
+    if worker is not None and not any_stack and any("unknown" in line for line in lines):
+        raise not_found("worker", worker, names, f"the program {name!r}")
 
 
 def _text(stack: dict[str, Any]) -> str:

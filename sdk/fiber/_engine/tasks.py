@@ -50,15 +50,17 @@ class LossCounts(NamedTuple):
 class Charges:
     """Losses that are charged to the tasks of one job, by their indices."""
 
-    __slots__ = ("deaths", "disruptions", "limits")
+    __slots__ = ("deaths", "disruptions", "limits", "lost")
 
     def __init__(self, limits: Limits) -> None:
         self.limits = limits
+        self.lost = 0  # runs, of all tasks
         self.deaths: dict[int, int] = {}
         self.disruptions: dict[int, int] = {}
 
     def charge(self, task: int, *, disrupted: bool = False) -> bool:
         """Count one more lost run; return False if the task may not run again."""
+        self.lost += 1
         counts = self.disruptions if disrupted else self.deaths
         limit = self.limits.disruptions if disrupted else self.limits.retries
         counts[task] = count = counts.get(task, 0) + 1

@@ -11,6 +11,9 @@ import contextlib
 import os
 import shutil
 
+HUB_SOCKET = "hub"
+"""Name of the hub's socket."""
+
 _NOTE = "memory-"
 
 

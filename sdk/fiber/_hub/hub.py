@@ -25,7 +25,7 @@ from fiber._exceptions import fresh
 from fiber._hub import protocol
 from fiber._hub.client import NoHub, ObjectUnreachable
 from fiber._hub.client_handler import ClientHandler
-from fiber._hub.directory import remove_directory
+from fiber._hub.directory import HUB_SOCKET, remove_directory
 from fiber._hub.heap import block_of
 from fiber._hub.hosted import (
     HostedChannel,
@@ -271,7 +271,7 @@ def _listen(parent: str | None, directory: str | None) -> tuple[socket.socket, s
         directory = tempfile.mkdtemp(prefix="fiber-", dir=parent)
     else:
         os.mkdir(directory, 0o700)
-    path = os.path.join(directory, "hub")
+    path = os.path.join(directory, HUB_SOCKET)
     with contextlib.ExitStack() as undo:
         undo.callback(remove_directory, directory)
         with naming_the_limit("opening the hub"):

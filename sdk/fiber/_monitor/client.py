@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import glob
 import json
 import os
 import socket
+import stat
 import tempfile
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from fiber._hub.directory import remove_directory
+from fiber._hub.directory import HUB_SOCKET, remove_directory
 from fiber._monitor.server import PEER, SOCKET
 
 PATIENCE = 10.0
@@ -19,6 +21,10 @@ PATIENCE = 10.0
 
 class NoAnswer(Exception):
     """Error: the program does not answer, or has ended; the message says which."""
+
+
+class Ended(NoAnswer):
+    """Error: the program has ended."""
 
 
 def sockets(parent: str | None = None) -> list[str]:
@@ -46,12 +52,12 @@ def ask(
                 for line in stream:
                     yield json.loads(line)
         except ConnectionRefusedError as error:
-            remove_directory(os.path.dirname(path))  # the program was killed
-            raise NoAnswer("the program has ended") from error
-        except TimeoutError as error:
+            _remove_leftovers(os.path.dirname(path))
+            raise Ended("the program has ended") from error
+        except (TimeoutError, BlockingIOError) as error:  # or too many clients wait already
             raise NoAnswer(f"the program does not answer within {patience:.0f} s") from error
         except (OSError, ValueError) as error:
-            raise NoAnswer(f"the program has ended: {error}") from error
+            raise Ended(f"the program has ended: {error}") from error
 
 
 def pid_of(path: str) -> int | None:
@@ -66,9 +72,17 @@ def pid_of(path: str) -> int | None:
 
 
 def _is_mine(path: str) -> bool:
-    """Return whether only this user can have made the socket."""
+    """Return whether it is a socket that only this user can have made."""
     try:
-        found = os.lstat(os.path.dirname(path))
+        directory, found = os.lstat(os.path.dirname(path)), os.lstat(path)
     except OSError:
         return False
-    return found.st_uid == os.geteuid() and found.st_mode & 0o077 == 0
+    is_private = directory.st_uid == os.geteuid() and directory.st_mode & 0o077 == 0
+    return is_private and stat.S_ISSOCK(found.st_mode)
+
+
+def _remove_leftovers(directory: str) -> None:
+    """Remove the directory of a program that was killed, if it is one of Fiber's."""
+    with contextlib.suppress(OSError):
+        if stat.S_ISSOCK(os.lstat(os.path.join(directory, HUB_SOCKET)).st_mode):
+            remove_directory(directory)

@@ -22,10 +22,17 @@ from fiber._transport.loop import Loop
 SOCKET = "monitor"
 """Name of the socket in the program's directory."""
 
+_UNFINISHED = "mon"
+"""Name of the socket until it listens; short, as paths of sockets are."""
+
 PEER = struct.Struct("iII")
 """Credentials of the other end of a socket: pid, uid, gid."""
 
 _MOST_CLIENTS = 32
+_BACKLOG = 4096
+"""Clients that may wait for a program that is stopped.  Those that gave up count, too."""
+_ACCEPT_AGAIN = 0.1
+"""Seconds until the next attempt to accept a client, if no descriptor is free."""
 _LONGEST = 1 << 16
 """Bytes of a request."""
 _PATIENCE = 10.0
@@ -45,12 +52,17 @@ class MonitorServer:
         self._path = os.path.join(directory, SOCKET)
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
         try:
-            self._listener.bind(self._path)
-            self._listener.listen(_MOST_CLIENTS)
+            self._listen(os.path.join(directory, _UNFINISHED))
         except BaseException:
             self._listener.close()
             raise
         loop.call_soon(loop.register, self._listener.fileno(), self._accept)
+
+    def _listen(self, unfinished: str) -> None:
+        # A socket that does not listen yet would look like that of a killed program.
+        self._listener.bind(unfinished)
+        self._listener.listen(_BACKLOG)
+        os.rename(unfinished, self._path)
 
     def close(self) -> None:
         """Refuse clients, and end the answers.  Runs after the end of the loop."""
@@ -70,7 +82,11 @@ class MonitorServer:
     def _accept(self) -> None:
         try:
             client, _ = self._listener.accept()
-        except OSError:  # the client is gone, or no descriptor is free
+        except BlockingIOError:  # the client is gone
+            return
+        except OSError:  # no descriptor is free, and the loop would spin
+            self._loop.pause(self._listener.fileno())
+            self._loop.call_later(_ACCEPT_AGAIN, self._accept_again)
             return
         _, uid, _ = PEER.unpack(client.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, PEER.size))
         if uid not in (os.geteuid(), 0) or len(self._clients) >= _MOST_CLIENTS:
@@ -85,6 +101,10 @@ class MonitorServer:
             _logs.debug("no thread for a client of the monitor: %s", error)
             self._clients.discard(client)
             client.close()
+
+    def _accept_again(self) -> None:
+        if self._listener.fileno() >= 0:
+            self._loop.resume(self._listener.fileno())
 
     def _serve(self, client: socket.socket) -> None:
         try:

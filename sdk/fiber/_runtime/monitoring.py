@@ -206,6 +206,6 @@ def own_stacks() -> str:
 
 
 def _stack(name: str, frame: FrameType) -> str:
-    calls = reversed(traceback.extract_stack(frame))
-    lines = [f'  File "{call.filename}", line {call.lineno} in {call.name}' for call in calls]
+    calls = ((call.f_code, line) for call, line in traceback.walk_stack(frame))
+    lines = [f'  File "{code.co_filename}", line {line} in {code.co_name}' for code, line in calls]
     return "\n".join([f"Thread {name} (most recent call first):", *lines])

@@ -134,6 +134,13 @@ def exceptions(
     return classes
 
 
+def label(progress: Any, name: str) -> str:
+    """Return the label of a map whose progress is to be shown; empty if it is not."""
+    if not isinstance(progress, bool | str):
+        raise TypeError(f"progress must be True, False or a text, not {progress!r}")
+    return progress if isinstance(progress, str) else name if progress else ""
+
+
 def chunksize(value: Any) -> int:
     """Return the number of items that travel together."""
     size = whole("chunksize", value)

@@ -58,8 +58,8 @@ class Runtime:
         self.pools: weakref.WeakSet[WatchedPool] = weakref.WeakSet()
         """Executors with workers.  Only the loop thread adds and removes them."""
         self._monitor: MonitorServer | None = None
-        self._is_watchable = not child.host
-        """True until the monitor listens, or cannot."""
+        self._unwatched = threading.Lock()
+        """Lock that the first child takes for ever: it opens the monitor."""
         try:
             self.hub = self._make_hub()
             self.backend: Backend = _make_backend(self)
@@ -136,9 +136,8 @@ class Runtime:
 
     def _listen_to_monitors(self) -> None:
         """Open the socket of the monitor, with the first child.  A program runs without it, too."""
-        if self.hub is None or not self._is_watchable:
+        if self.hub is None or child.host or not self._unwatched.acquire(blocking=False):
             return
-        self._is_watchable = False
         if directory := os.path.dirname(self.hub.address_or_problem.path):
             try:
                 self._monitor = MonitorServer(self.loop, directory, self._answer_monitor)

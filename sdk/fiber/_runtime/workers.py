@@ -414,6 +414,11 @@ class WorkerView:
         """Return the states of all workers, the oldest first."""
         return [_describe(handle) for handle in list(self._workers.members)]
 
+    def busy(self) -> int:
+        """Return the number of workers that have tasks."""
+        handles: list[Any] = list(self._workers.members)
+        return sum(handle.state == "busy" for handle in handles)
+
     def wait_until_up(self, timeout: float | None) -> bool:
         """Wait until the pool's minimum of workers are ready, or cannot start.
 

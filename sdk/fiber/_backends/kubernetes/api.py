@@ -427,7 +427,12 @@ class Login(NamedTuple):
 
     @staticmethod
     def is_configured() -> bool:
-        """Return whether there is a kubeconfig, or an account of this pod."""
+        """Return whether this environment can use a cluster.
+
+        It needs a kubeconfig or an account of this pod, and the package that logs in.
+        """
+        if importlib.util.find_spec("kubernetes") is None:
+            return False
         names = (os.environ.get("KUBECONFIG") or os.path.expanduser(_KUBECONFIG)).split(os.pathsep)
         return "KUBERNETES_SERVICE_HOST" in os.environ or any(map(os.path.exists, names))
 
