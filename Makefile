@@ -22,7 +22,7 @@ unexport PYTHONDONTWRITEBYTECODE
 CLUSTER := PYTHONPATH=tests $(BIN)/python -m cluster
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-fast test-pythons test-long e2e lint bench bench-operator bench-kubernetes conformance conformance-original crds images cluster cluster-down release release-prepare release-dry-run clean
+.PHONY: help demo test test-fast test-pythons test-long e2e lint bench bench-operator bench-kubernetes conformance conformance-original crds docs images cluster cluster-down release release-prepare release-dry-run clean
 
 help:
 	@sed -n 's/^## //p' $(MAKEFILE_LIST)
@@ -124,6 +124,10 @@ conformance-original: $(VENV)/.with-dev
 crds: $(VENV)/.with-dev
 	$(BIN)/python -m fiber_api.schema
 
+## make docs          the documentation as a site, into build/site; warnings and broken links are errors
+docs: $(VENV)/.with-docs
+	$(BIN)/python -m docsite
+
 ## make images        the operator's image and the workers', by docker or buildah, into build/images
 images: $(VENV)/.made
 	$(CLUSTER) images
@@ -166,7 +170,8 @@ $(VENV)/.made:
 $(VENV)/.with-rl: EXTRAS := rl
 $(VENV)/.with-dev: EXTRAS := dev,rl
 $(VENV)/.with-bench: EXTRAS := bench,rl
-$(VENV)/.with-rl $(VENV)/.with-dev $(VENV)/.with-bench: $(VENV)/.made pyproject.toml
+$(VENV)/.with-docs: EXTRAS := docs
+$(VENV)/.with-rl $(VENV)/.with-dev $(VENV)/.with-bench $(VENV)/.with-docs: $(VENV)/.made pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[$(EXTRAS)]'
 	touch $@
 

@@ -58,7 +58,7 @@ def test_decision_records_have_four_parts_and_are_short(record: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "folder", ["benchmarks", "crds", "examples", "operator", "release", "sdk", "tests"]
+    "folder", ["benchmarks", "crds", "docsite", "examples", "operator", "release", "sdk", "tests"]
 )
 def test_docstrings_begin_with_a_verb_or_a_noun(folder: str) -> None:
     paths = sorted((ROOT / folder).rglob("*.py"))
