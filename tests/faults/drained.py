@@ -40,10 +40,22 @@ class Site(ABC):
         """Send SIGTERM to the host."""
 
     def drain(self, host: str) -> RemoteAgent:
-        """Send SIGTERM to a host, and wait until the program has received its notice."""
+        """Send SIGTERM to a host, and wait until the program has received its agent's notice.
+
+        A deleted pod is known to the program earlier, while its workers still begin tasks.
+        """
         (agent,) = (agent for agent in self.agents() if agent.host == host)
-        self.tell(host)
-        wait_for(lambda: bool(agent.leaving))
+        reasons: list[str] = []
+        leave = agent.leave
+
+        def note(reason: str) -> None:
+            leave(reason)
+            reasons.append(reason)
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(agent, "leave", note)
+            self.tell(host)
+            wait_for(lambda: any(reason.startswith("Drained") for reason in reasons))
         return agent
 
     def busy(self) -> list[str]:
