@@ -38,6 +38,7 @@ def pytest_configure() -> None:
     # A shell without job control starts what it puts in the background with interrupts ignored,
     # and every program that a test starts would inherit that.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup has it ignored
     # The same examples in every run; how long one takes says more about the machine.
     settings.register_profile("tests", derandomize=True, deadline=None)
     settings.load_profile("tests")
