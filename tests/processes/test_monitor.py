@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
@@ -14,6 +15,7 @@ import fiber
 from census import wait_until
 from faults import pool_targets as tasks
 from fiber._monitor import client
+from fiber._runtime import state as state_module
 from fiber.pool import Pool
 from patience import PATIENCE
 
@@ -187,3 +189,20 @@ def test_a_pool_that_has_ended_is_no_longer_seen(pool: Pool) -> None:
     pool.close()
     pool.join()
     assert (state()["pool"], state()["child"], len(state()["death"])) == ([], [], deaths)
+
+
+def test_a_start_after_the_end_leaves_no_directory() -> None:
+    ended = state_module.Runtime()
+    ended.close()
+    process = fiber.Process(target=print)
+    with contextlib.suppress(RuntimeError):  # the local backend refuses
+        ended.start(process, cast("Any", _Owner()))
+    assert ended.hub is not None
+    assert ended.hub.directory is None or not os.path.exists(ended.hub.directory)
+
+
+class _Owner:
+    """Owner of a child that never starts."""
+
+    started = received = recalled = draining = begin = exited = print
+    state = "starting"

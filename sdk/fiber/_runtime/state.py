@@ -31,7 +31,7 @@ from fiber._runtime.pool_state import WatchedPool
 from fiber._transport.channels import naming_the_limit
 from fiber._transport.loop import Loop
 from fiber._wire.memory_files import Blob
-from fiber.errors import StartError
+from fiber.errors import FiberError, StartError
 from fiber.resources import resources_of
 
 if TYPE_CHECKING:
@@ -58,8 +58,8 @@ class Runtime:
         self.pools: weakref.WeakSet[WatchedPool] = weakref.WeakSet()
         """Executors with workers.  Only the loop thread adds and removes them."""
         self._monitor: MonitorServer | None = None
-        self._unwatched = threading.Lock()
-        """Lock that the first child takes for ever: it opens the monitor."""
+        self._can_be_watched = not child.host
+        """True until the loop has opened the monitor, or has found that it cannot."""
         try:
             self.hub = self._make_hub()
             self.backend: Backend = _make_backend(self)
@@ -109,7 +109,6 @@ class Runtime:
         error in pickling is raised here.  If the caller is interrupted, either no child starts, or
         ``begin`` is called, before any request that the caller makes later.
         """
-        self._listen_to_monitors()
         same_host = self.backend.same_host
         preparation, program = self._preparation(process, anew=not tasks)
         arguments = None if shared is None else shared.blob(same_host=same_host)
@@ -131,18 +130,24 @@ class Runtime:
             resources=resources_of(getattr(process, "_target", None) or process.run),
         )
         made = self.backend.child(spec, observer)
+        if self._can_be_watched:
+            self.loop.call_soon(self._listen_to_monitors)
         self.loop.call_soon(observer.begin, made)
         return made
 
     def _listen_to_monitors(self) -> None:
-        """Open the socket of the monitor, with the first child.  A program runs without it, too."""
-        if self.hub is None or child.host or not self._unwatched.acquire(blocking=False):
+        """Open the socket of the monitor, with the first child.  A program runs without it, too.
+
+        Runs on the loop thread: once that has ended, nothing makes the hub's directory again.
+        """
+        if self.hub is None or not self._can_be_watched:
             return
-        if directory := os.path.dirname(self.hub.address_or_problem.path):
-            try:
+        self._can_be_watched = False
+        try:
+            if directory := os.path.dirname(self.hub.address_or_problem.path):
                 self._monitor = MonitorServer(self.loop, directory, self._answer_monitor)
-            except OSError as error:
-                _logs.debug("this program cannot be watched: %s", error)
+        except (OSError, FiberError) as error:
+            _logs.debug("this program cannot be watched: %s", error)
 
     def _answer_monitor(self, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
         from fiber._runtime.monitoring import Monitor  # rarely needed
