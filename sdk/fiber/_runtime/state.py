@@ -144,10 +144,18 @@ class Runtime:
             return
         self._can_be_watched = False
         try:
-            if directory := os.path.dirname(self.hub.address_or_problem.path):
+            address = self.hub.address_or_problem if self._cleans_up() else self.hub.known_address
+            if address is not None and (directory := os.path.dirname(address.path)):
                 self._monitor = MonitorServer(self.loop, directory, self._answer_monitor)
         except (OSError, FiberError) as error:
             _logs.debug("this program cannot be watched: %s", error)
+
+    def _cleans_up(self) -> bool:
+        """Return whether the hub's directory goes when this program is killed.
+
+        Zygotes and agents of this host remove it, or it goes with the pod of the program.
+        """
+        return not self.elastic or "KUBERNETES_SERVICE_HOST" in os.environ
 
     def _answer_monitor(self, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
         from fiber._runtime.monitoring import Monitor  # rarely needed
