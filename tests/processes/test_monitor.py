@@ -131,7 +131,7 @@ def test_all_children_and_the_program_show_their_stacks(pool: Pool) -> None:
     finally:
         process.kill()
         process.join()
-    assert [line["child"]["state"] for line in ask(ask="children")] == ["idle"]
+    assert [facts["state"] for facts in state()["child"]] == ["idle"]
 
 
 def test_an_unknown_worker_is_said_to_be_unknown(pool: Pool) -> None:

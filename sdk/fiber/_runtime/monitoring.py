@@ -3,7 +3,6 @@
 Each answer begins with ``{"program": …}``, the facts of the program.  The request's ``ask`` says
 what follows:
 
-``children``  ``{"child": …}`` for each child
 ``state``     ``{"pool": …}`` for each pool (``PoolState``), ``{"child": …}`` for each child, and
               ``{"death": …}`` for the last children that ended by themselves
 ``stacks``    ``{"stack": …}`` for the program itself and for each child, as the answers come.  With
@@ -62,10 +61,7 @@ class Monitor:
         """Yield the lines of the answer."""
         yield {"program": self._program()}
         ask = request.get("ask")
-        if ask == "children":
-            for facts in self._on_loop(self._describe_children):
-                yield {"child": facts}
-        elif ask == "state":
+        if ask == "state":
             yield from self._on_loop(self._state)
         elif ask == "stacks":
             yield from self._stacks(request.get("worker"))
