@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 import fiber
-from fakes.cluster import FakeCluster, fake_cluster
+from faults import drained
 from faults.program import Program
 from faults.runtime import running
 from fiber.errors import StartError
 from patience import PATIENCE
-from unit.kubernetes_rig import kubeconfig
 
 pytestmark = [
     pytest.mark.may_leak("the operator's connections, for as long as the cluster is there"),
@@ -23,12 +22,7 @@ WAY_OUT = "`fiber image build --tag REGISTRY/NAME --push`"
 LACKS = "The image of the workers has no package 'only_here'."
 
 
-@pytest.fixture(scope="module")
-def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FakeCluster]:
-    folder = tmp_path_factory.mktemp("cluster")
-    with fake_cluster() as cluster, pytest.MonkeyPatch.context() as patch:
-        patch.setenv("KUBECONFIG", str(kubeconfig(folder, cluster.url)))
-        yield cluster
+cluster = drained.played_cluster
 
 
 @pytest.fixture

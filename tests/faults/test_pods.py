@@ -18,7 +18,8 @@ import numpy as np
 import pytest
 
 import fiber
-from fakes.cluster import FakeCluster, fake_cluster
+from fakes.cluster import FakeCluster
+from faults import drained
 from faults.program import Program
 from faults.proxy import Proxy
 from faults.runtime import running
@@ -29,7 +30,6 @@ from fiber.errors import ConfigError, FiberPoolError, MemberLost, WorkerDied
 from fiber_api import names
 from patience import PATIENCE
 from ports import reserved_port
-from unit.kubernetes_rig import kubeconfig
 
 KEPT = ("fiberpools", "pods", "secrets", "leases", "services", "endpointslices")
 OPERATORS = {names.operator_lease_name("fiber-operator"), names.SERVING_LEASE}
@@ -41,12 +41,7 @@ pytestmark = [
 ]
 
 
-@pytest.fixture(scope="module")
-def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FakeCluster]:
-    folder = tmp_path_factory.mktemp("cluster")
-    with fake_cluster() as cluster, pytest.MonkeyPatch.context() as patch:
-        patch.setenv("KUBECONFIG", str(kubeconfig(folder, cluster.url)))
-        yield cluster
+cluster = drained.played_cluster
 
 
 @pytest.fixture(autouse=True)
