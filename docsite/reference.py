@@ -275,9 +275,10 @@ def _bounds(value: Mapping[str, Any]) -> Iterator[str]:
 
 def commands_page() -> str:
     """Return the page of the command, with the help that each command prints."""
+    group = _group()
     parts = [
         "# The command's help\n\n[The command fiber](../command.md) explains what it is for.",
-        *_helps(_group(), click.Context(_group(), info_name="fiber")),
+        *_helps(group, group.make_context("fiber", [], resilient_parsing=True)),
     ]
     return "\n\n".join(parts) + "\n"
 

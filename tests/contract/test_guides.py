@@ -209,15 +209,19 @@ def test_a_command_has_options_that_exist(page: str, command: str) -> None:
     parse(_group(), "fiber", shlex.split(command))
 
 
-def parse(command: click.Command, name: str, words: list[str]) -> None:
+def parse(
+    command: click.Command, name: str, words: list[str], parent: click.Context | None = None
+) -> None:
     """Parse the words as far as the command that they name; raise UsageError for a mistake."""
-    context = command.make_context(name, words, resilient_parsing=words in ([], ["--version"]))
+    context = command.make_context(
+        name, words, parent, resilient_parsing=words in ([], ["--version"])
+    )
     if isinstance(command, click.Group) and (below := [*context._protected_args, *context.args]):
         found, inner, rest = command.resolve_command(context, below)
         assert found is not None
         assert inner is not None
         if rest:  # else a sentence names the command alone
-            parse(inner, found, rest)
+            parse(inner, found, rest, context)
 
 
 def test_commands_with_mistakes_are_found() -> None:

@@ -22,10 +22,11 @@ from unit.pool_command_rig import Outcome
 COMMAND = [sys.executable, "-m", "fiber._cli.main"]
 
 WAITS = """
-import signal, sys
-print("begun", flush=True)
+import signal, sys, time
 try:
-    signal.pause()
+    print("begun", flush=True)
+    while True:  # one long wait would miss a signal that came just before it
+        time.sleep(0.1)
 except KeyboardInterrupt:
     print("interrupted", flush=True)
     {then}

@@ -295,7 +295,8 @@ def test_a_signal_just_before_the_wait_for_the_program_is_passed_on(site: Site) 
 
 
 def test_an_interrupt_reaches_the_group(site: Site) -> None:
-    child = f"{sys.executable} -c 'import signal; print(1, flush=True); signal.pause()'"
+    waits = "print(1, flush=True)\nwhile True: time.sleep(0.1)"
+    child = f"{sys.executable} -c 'import time\n{waits}'"
     pod = site.shell(f"trap 'echo shell' INT; {child}; exit 4")
     pod.read(until=b"1\n")
     found = pod.read(begun=lambda: pod.signal(signal.SIGINT))
