@@ -11,9 +11,7 @@ Variables `FIBER_AGENT_*` are not configuration: backends and pods set them for 
 
 from __future__ import annotations
 
-import copy
 import itertools
-import math
 import os
 import pickle
 import re
@@ -21,153 +19,25 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypedDict, Unpack, get_args
+from typing import TYPE_CHECKING, Any, NamedTuple, Unpack, get_args
 
+from fiber import _config_rules as rules
 from fiber import _config_sources, resources
+from fiber._config_types import Backend, LogLevel, Progress, Relay
 from fiber.errors import ConfigError
 
+if TYPE_CHECKING:
+    from fiber._config_types import ConfigKeywords
+
 __all__ = ["Config", "current", "guard", "init", "install", "load", "use"]
-
-
-class _Rule(NamedTuple):
-    """Rule for the values of a key.  `check` returns the value to keep, or raises ValueError."""
-
-    expects: str
-    check: Callable[[object], object]
-    from_text: Callable[[str], object] = str
-    is_path: bool = False
-    """True if a text is a path, relative to the folder of the file that has it."""
-
-
-def _choice(*choices: str) -> _Rule:
-    def check(value: object) -> str:
-        for choice in choices:
-            if isinstance(value, str) and value.lower() == choice.lower():
-                return choice
-        raise ValueError
-
-    return _Rule(f"one of {', '.join(map(repr, choices))}", check)
-
-
-def _whole(low: int, high: int | None = None) -> _Rule:
-    def check(value: object) -> int:
-        if not isinstance(value, int) or isinstance(value, bool) or value < low:
-            raise ValueError
-        if high is not None and value > high:
-            raise ValueError
-        return value
-
-    reach = f"of at least {low}" if high is None else f"from {low} to {high}"
-    return _Rule(f"a whole number {reach}", check, from_text=int)
-
-
-def _ports() -> _Rule:
-    def check(value: object) -> int | str:
-        numbers = re.fullmatch(r"(\d{1,5})(?:-(\d{1,5}))?", str(value).strip())
-        if numbers is None or isinstance(value, bool):
-            raise ValueError
-        first, last = int(numbers[1]), int(numbers[2] or numbers[1])
-        if not (min(1, last) <= first <= last <= 65535):
-            raise ValueError
-        return first if first == last else f"{first}-{last}"
-
-    return _Rule("a whole number from 0 to 65535, or a range of ports such as '9000-9009'", check)
-
-
-def _seconds() -> _Rule:
-    def check(value: object) -> float:
-        if not isinstance(value, int | float) or isinstance(value, bool):
-            raise ValueError
-        if not math.isfinite(value) or value <= 0:
-            raise ValueError
-        return float(value)
-
-    return _Rule("a number of seconds above 0", check, from_text=float)
-
-
-def _word(expects: str, pattern: str = r"\S+") -> _Rule:
-    def check(value: object) -> str:
-        if not isinstance(value, str) or not re.fullmatch(pattern, value.strip()):
-            raise ValueError
-        return value.strip()
-
-    return _Rule(expects, check)
-
-
-def _pool() -> _Rule:
-    def check(value: object) -> str:
-        from fiber_api import names  # only programs on Kubernetes need it
-
-        if not isinstance(value, str):
-            raise ValueError
-        return names.check_pool_name(value.strip())
-
-    return _Rule("the name of a FiberPool: lower-case letters, digits and '-', at most 50", check)
-
-
-def _template() -> _Rule:
-    def check(value: object) -> str | dict[str, Any]:
-        if isinstance(value, Mapping):
-            return copy.deepcopy(dict(value))
-        if not isinstance(value, str | os.PathLike) or not os.fspath(value):
-            raise ValueError
-        # The file is read later: only programs on Kubernetes need it.
-        return os.path.abspath(os.fsdecode(value))
-
-    expects = "the path of a YAML or JSON file with a pod template, or a dict of one"
-    return _Rule(expects, check, is_path=True)
-
-
-def _amount(expects: str, read: Callable[[object], object], *, or_none: bool) -> _Rule:
-    def check(value: object) -> object:
-        nothing = or_none and not isinstance(value, bool) and value in (0, "0")
-        return 0 if nothing else read(value)
-
-    def from_text(text: str) -> object:
-        return int(text) if text.strip().isdecimal() else text.strip()
-
-    return _Rule(expects, check, from_text=from_text)
-
-
-def _node_selector() -> _Rule:
-    def check(value: object) -> dict[str, str]:
-        return dict(resources.read_node_selector(value))
-
-    return _Rule("a dict of the labels of nodes, or a text as 'disk=ssd,zone=a'", check)
-
-
-def _tolerations() -> _Rule:
-    def check(value: object) -> tuple[dict[str, Any], ...]:
-        return tuple(dict(one) for one in resources.read_tolerations(value))
-
-    return _Rule("a list of tolerations, or a text as 'spot,team=a:NoSchedule'", check)
-
-
-def _directory() -> _Rule:
-    def check(value: object) -> str:
-        if not isinstance(value, str | os.PathLike):
-            raise ValueError
-        path = os.fsdecode(value)
-        if not os.path.isabs(path) or not os.path.isdir(path):
-            raise ValueError
-        if not os.access(path, os.W_OK | os.X_OK):
-            raise ValueError
-        return path
-
-    return _Rule("the absolute path of a directory that exists and can be written to", check)
 
 
 _LABEL = "[a-z0-9]([-a-z0-9]{0,61}[a-z0-9])?"
 
 
-def _key(default: Any, rule: _Rule, *, fixed: bool = False) -> Any:
+def _key(default: Any, rule: rules.KeyRule, *, fixed: bool = False) -> Any:
     """Return the field of a key; `fixed`: read once, when the runtime starts."""
     return field(default=default, metadata={"rule": rule, "fixed": fixed})
-
-
-Backend = Literal["local", "loopback", "kubernetes", "auto"]
-Relay = Literal["auto", "always", "never"]
-LogLevel = Literal["DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -232,86 +102,75 @@ class Config:
         how often in a row a vector environment makes its environments again for that reason.
     log_level: the least severe level that is shown on stderr, in children, too, as by
         `fiber.log_to_stderr()`. "DEBUG" shows each start and end of workers, agents and links.
+    progress: whether maps show their progress that are not called with `progress=`: "always",
+        "never", or "auto", which means in a terminal or a notebook.
+    dashboard*: start the program's live page at its first process, and print the page's address.
+        See `fiber dashboard`.
+    timeline*: write the program's timeline at its end to this file. The suffix chooses the form, as
+        in `fiber.timeline`.
+    metrics_port*: serve the program's metrics for Prometheus at this port; 0 takes a free one. The
+        address is that of `metrics_host`. None serves none.
+    metrics_host*: the address at which the metrics are served.
+    log_to*: also write the output of each worker to a file of its own in this folder.
+    log_records*: the least severe level of `logging` records that children send to the program's
+        handlers. None sends none.
     runtime_directory*: where Fiber makes its private directory for sockets and credentials.
         None means `tempfile.gettempdir()`. Choose a short path: paths of sockets have a limit.
     """
 
-    backend: Backend = _key("auto", _choice(*get_args(Backend)), fixed=True)  # noqa: RUF009 - a field
-    agents: int = _key(2, _whole(1), fixed=True)
-    processes_per_agent: int = _key(0, _whole(0), fixed=True)
-    namespace: str | None = _key(None, _word("the name of a namespace", _LABEL), fixed=True)
-    context: str | None = _key(None, _word("the name of a context", r"\S(.*\S)?"), fixed=True)
-    image: str | None = _key(None, _word("the name of an image"), fixed=True)
-    template: str | Mapping[str, Any] | None = _key(None, _template(), fixed=True)
-    pool: str | None = _key(None, _pool(), fixed=True)
-    processes_per_pod: int = _key(1, _whole(1, 1024), fixed=True)
+    backend: Backend = _key("auto", rules.choice(*get_args(Backend)), fixed=True)  # noqa: RUF009 - a field
+    agents: int = _key(2, rules.whole(1), fixed=True)
+    processes_per_agent: int = _key(0, rules.whole(0), fixed=True)
+    namespace: str | None = _key(None, rules.word("the name of a namespace", _LABEL), fixed=True)
+    context: str | None = _key(None, rules.word("the name of a context", r"\S(.*\S)?"), fixed=True)
+    image: str | None = _key(None, rules.word("the name of an image"), fixed=True)
+    template: str | Mapping[str, Any] | None = _key(None, rules.template(), fixed=True)
+    pool: str | None = _key(None, rules.pool(), fixed=True)
+    processes_per_pod: int = _key(1, rules.whole(1, 1024), fixed=True)
     cpu_request: float = _key(
-        0.05, _amount("CPUs, as 0.5 or '500m'", resources.read_cpus, or_none=True), fixed=True
+        0.05, rules.amount("CPUs, as 0.5 or '500m'", resources.read_cpus, or_none=True), fixed=True
     )
     memory_request: int = _key(
-        64, _amount("MiB, or a text as '512Mi'", resources.read_mebibytes, or_none=True), fixed=True
+        64,
+        rules.amount("MiB, or a text as '512Mi'", resources.read_mebibytes, or_none=True),
+        fixed=True,
     )
     shm: int | None = _key(
         None,
-        _amount("MiB above 0, or a text as '2Gi'", resources.read_mebibytes, or_none=False),
+        rules.amount("MiB above 0, or a text as '2Gi'", resources.read_mebibytes, or_none=False),
         fixed=True,
     )
-    node_selector: Mapping[str, str] | None = _key(None, _node_selector(), fixed=True)
-    tolerations: Sequence[str | Mapping[str, Any]] | None = _key(None, _tolerations(), fixed=True)
-    max_pods: int = _key(1000, _whole(1, 100_000), fixed=True)
-    pod_timeout: float = _key(600.0, _seconds(), fixed=True)
-    idle_timeout: float = _key(60.0, _seconds(), fixed=True)
-    listen_host: str | None = _key(None, _word("a host name or address"), fixed=True)
-    listen_port: int | str = _key(0, _ports(), fixed=True)
-    advertised_host: str | None = _key(None, _word("a host name or address"), fixed=True)
-    relay: Relay = _key("auto", _choice(*get_args(Relay)), fixed=True)  # noqa: RUF009 - a field
-    start_timeout: float = _key(60.0, _seconds())
-    heartbeat_interval: float = _key(1.0, _seconds(), fixed=True)
-    suspect_after: float = _key(5.0, _seconds(), fixed=True)
-    lost_after: float = _key(15.0, _seconds(), fixed=True)
-    retries: int = _key(3, _whole(0))
-    disruptions: int = _key(20, _whole(0))
-    log_level: LogLevel = _key("WARNING", _choice(*get_args(LogLevel)))  # noqa: RUF009 - a field
-    runtime_directory: str | None = _key(None, _directory(), fixed=True)
+    node_selector: Mapping[str, str] | None = _key(None, rules.node_selector(), fixed=True)
+    tolerations: Sequence[str | Mapping[str, Any]] | None = _key(
+        None, rules.tolerations(), fixed=True
+    )
+    max_pods: int = _key(1000, rules.whole(1, 100_000), fixed=True)
+    pod_timeout: float = _key(600.0, rules.seconds(), fixed=True)
+    idle_timeout: float = _key(60.0, rules.seconds(), fixed=True)
+    listen_host: str | None = _key(None, rules.word("a host name or address"), fixed=True)
+    listen_port: int | str = _key(0, rules.ports(), fixed=True)
+    advertised_host: str | None = _key(None, rules.word("a host name or address"), fixed=True)
+    relay: Relay = _key("auto", rules.choice(*get_args(Relay)), fixed=True)  # noqa: RUF009 - a field
+    start_timeout: float = _key(60.0, rules.seconds())
+    heartbeat_interval: float = _key(1.0, rules.seconds(), fixed=True)
+    suspect_after: float = _key(5.0, rules.seconds(), fixed=True)
+    lost_after: float = _key(15.0, rules.seconds(), fixed=True)
+    retries: int = _key(3, rules.whole(0))
+    disruptions: int = _key(20, rules.whole(0))
+    log_level: LogLevel = _key("WARNING", rules.choice(*get_args(LogLevel)))  # noqa: RUF009 - a field
+    progress: Progress = _key("never", rules.choice(*get_args(Progress)))  # noqa: RUF009 - a field
+    dashboard: bool = _key(False, rules.switch(), fixed=True)
+    timeline: str | None = _key(None, rules.path(), fixed=True)
+    metrics_port: int | None = _key(None, rules.whole(0, 65535), fixed=True)
+    metrics_host: str = _key("127.0.0.1", rules.word("a host name or address"), fixed=True)
+    log_to: str | None = _key(None, rules.path(), fixed=True)
+    log_records: LogLevel | None = _key(  # noqa: RUF009 - a field
+        None, rules.choice(*get_args(LogLevel)), fixed=True
+    )
+    runtime_directory: str | None = _key(None, rules.directory(), fixed=True)
 
 
 _KEYS = {entry.name: entry for entry in fields(Config)}
-
-if TYPE_CHECKING:
-
-    class ConfigKeywords(TypedDict, total=False):
-        """The keys of `Config`, as `init` takes them."""
-
-        backend: Backend
-        agents: int
-        processes_per_agent: int
-        namespace: str | None
-        context: str | None
-        image: str | None
-        template: str | os.PathLike[str] | Mapping[str, Any] | None
-        pool: str | None
-        processes_per_pod: int
-        cpu_request: float | str
-        memory_request: int | str
-        shm: int | str | None
-        node_selector: Mapping[str, str] | None
-        tolerations: Sequence[str | Mapping[str, Any]] | None
-        max_pods: int
-        pod_timeout: float
-        idle_timeout: float
-        listen_host: str | None
-        listen_port: int | str
-        advertised_host: str | None
-        relay: Relay
-        start_timeout: float
-        heartbeat_interval: float
-        suspect_after: float
-        lost_after: float
-        retries: int
-        disruptions: int
-        log_level: LogLevel
-        runtime_directory: str | os.PathLike[str] | None
-
 
 # ---- the configuration in force -------------------------------------------------------------
 
@@ -437,7 +296,7 @@ def _checked(setting: _Setting) -> object:
     entry = _KEYS[setting.key]
     if setting.value is None and entry.default is None:
         return None
-    rule: _Rule = entry.metadata["rule"]
+    rule: rules.KeyRule = entry.metadata["rule"]
     try:
         value = rule.from_text(str(setting.value)) if setting.is_text else setting.value
         if rule.is_path and isinstance(value, str) and value:

@@ -22,6 +22,7 @@ from fiber._agent import service
 from fiber._agent.interface import UNKNOWN, Cause, ExitReport
 from fiber._backends import remote
 from fiber._backends.remote import RemoteTaskChannel
+from fiber._engine.activity import Activity
 from fiber._runtime import exchange, executor, workers
 from fiber._wire.packet import Message
 from simulation.agents import Agent, Child
@@ -41,6 +42,7 @@ class Stage:
         self.loop = world.loop
         self.config = SimpleNamespace(start_timeout=1.0)
         self.elastic = False
+        self.activity = Activity(0.0)
         self.pools: set[object] = set()
         self.rng = random.Random(f"{world.schedule.seed} stage")
         self.world = world

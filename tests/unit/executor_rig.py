@@ -10,6 +10,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from fiber._agent.interface import ExitReport
+from fiber._engine.activity import Activity
 from fiber._engine.ledger import Ledger
 from fiber._engine.tasks import Batch
 from fiber._runtime.executor import PoolExecutor
@@ -199,6 +200,7 @@ class Rig:
             loop=self.loop,
             start=self._start,
             elastic=False,
+            activity=Activity(0.0),
             pools=set(),
             look_at_program=lambda: None,
             config=SimpleNamespace(start_timeout=1.0),

@@ -170,7 +170,7 @@ def test_names_for_type_checkers_are_those_at_run_time() -> None:
 
 
 def test_init_has_a_typed_keyword_for_each_key() -> None:
-    tree = ast.parse((SDK / "config.py").read_text(encoding="utf-8"))
+    tree = ast.parse((SDK / "_config_types.py").read_text(encoding="utf-8"))
     (settings,) = (
         node
         for node in ast.walk(tree)

@@ -109,15 +109,17 @@ class _Unreadable:
 _UNREADABLE = _Unreadable()
 
 
-def single(message: Message, seq: int) -> Any:
-    """Return the result of the call that was sent alone as ``seq``, or OTHER."""
+def single(message: Message, seq: int) -> tuple[Any, float]:
+    """Return the result of the call that was sent alone as ``seq``, or OTHER; and its seconds."""
     try:
-        number, offset, kept, _, values, odd = pickle.loads(message.payload)
+        number, offset, kept, seconds, values, odd = pickle.loads(message.payload)
         if number == seq and offset == 0 and kept is None and len(values) == 1:
-            return outcomes(values, odd, message.buffers)[0] if odd else values[0]
+            if not 0.0 <= seconds < math.inf:
+                return OTHER, 0.0
+            return outcomes(values, odd, message.buffers)[0] if odd else values[0], seconds
     except Exception:  # any bytes may be there
         pass
-    return OTHER
+    return OTHER, 0.0
 
 
 def read(message: Message) -> MessageFields:

@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-import time
-from collections import deque
 from collections.abc import Callable, Iterator
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 from fiber._agent.interface import ChildHandle, ExitReport
 from fiber._agent.last_words import SHOW
+from fiber._engine.activity import Activity, ChildRecord
 from fiber._hub.handles import GrantSet
 from fiber._wire.packet import Message
-
-_DEATHS = 20
-"""Deaths that are kept for monitors."""
 
 _LONGEST_REASON = 200
 
 
 class ChildOwner(Protocol):
     """Owner of a child: starts it, and takes the agent's reports about it."""
+
+    record: ChildRecord | None
+    """Record of the child, set before ``begin``."""
 
     @property
     def state(self) -> str:
@@ -53,7 +52,6 @@ class Child:
     def __init__(self, children: Children, owner: ChildOwner, grants: GrantSet) -> None:
         self.handle: ChildHandle | None = None
         self.owner = owner
-        self.started = owner.started
         self.received = owner.received
         self.recalled = owner.recalled
         self.draining = owner.draining
@@ -65,15 +63,19 @@ class Child:
         """Start the child."""
         self.handle = handle
         self._children.add(self)
+        self.owner.record = self._children.new_record(handle.name)
         self.owner.begin(handle)
+
+    def started(self, pid: int) -> None:
+        """Note that the child runs."""
+        self._children.started(self, pid)
+        self.owner.started(pid)
 
     def exited(self, report: ExitReport) -> None:
         """Release unused grants, and forget the child."""
         if self._grants:
             self._grants.release()
-        if report.exitcode and self.owner.state != "leaving":
-            self._children.deaths.append(death_of(self, report))
-        self._children.remove(self)
+        self._children.exited(self, report)
         self.showed_stack(f"It has ended: {report.describe()}.")
         self.owner.exited(report)
         self.handle = None  # it has this object as its observer: a cycle
@@ -94,40 +96,44 @@ class Child:
             then(text)
 
 
-class Death(NamedTuple):
-    """End of a child that its program had not asked for."""
-
-    time: float
-    """Unix time."""
-    name: str
-    host: str
-    pid: int | None
-    reason: str
-
-
-def death_of(child: Child, report: ExitReport) -> Death:
-    """Return the death of a child, which has just ended."""
-    handle = child.handle
-    assert handle is not None
-    reason = report.describe()[:_LONGEST_REASON]
-    return Death(time.time(), handle.name, report.host or handle.host, handle.pid, reason)
-
-
 class Children:
-    """Children that were started and have not ended.  Runs on the loop thread."""
+    """Children that were started and have not ended.  Runs on the loop thread.
 
-    def __init__(self) -> None:
+    ``now`` returns the time for their records in the ``activity``.
+    """
+
+    def __init__(self, activity: Activity, now: Callable[[], float]) -> None:
         self._children: dict[Child, None] = {}
-        self.deaths: deque[Death] = deque(maxlen=_DEATHS)
-        """Last children that ended, and that this program had not asked to end."""
+        self._activity = activity
+        self._now = now
 
     def add(self, child: Child) -> None:
         """Note that a child is being started."""
         self._children[child] = None
 
+    def new_record(self, name: str) -> ChildRecord:
+        """Return the record of a child that is being started."""
+        return self._activity.add_child(name, self._now())
+
+    def started(self, child: Child, pid: int) -> None:
+        """Note that a child runs."""
+        handle, record = child.handle, child.owner.record
+        if handle is not None and record is not None:
+            self._activity.started(record, self._now(), handle.host, handle.node, pid)
+
     def remove(self, child: Child) -> None:
-        """Forget a child that has ended."""
+        """Forget a child."""
         self._children.pop(child, None)
+
+    def exited(self, child: Child, report: ExitReport) -> None:
+        """Forget a child that has ended, and complete its record."""
+        self.remove(child)
+        record = child.owner.record
+        if record is not None:
+            is_death = report.exitcode and child.owner.state != "leaving"
+            reason = report.describe()[:_LONGEST_REASON] if is_death else ""
+            record.host = report.host or record.host
+            self._activity.ended(record, self._now(), reason)
 
     def __len__(self) -> int:
         return len(self._children)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import pickle
+import time
 from collections.abc import Callable
 from itertools import chain
 
@@ -17,6 +18,7 @@ from fiber._engine.tasks import Batch, Job, WorkerEntry, WrongAnswer
 from fiber._runtime.answers import MessageFields, Pickled, TaskFailure, read
 from fiber._runtime.jobs import Jobs
 from fiber._runtime.leases import LeasedWorker, Leases
+from fiber._runtime.pool_activity import PoolActivity
 from fiber._runtime.threads import BackgroundThread, say
 from fiber._runtime.work_items import Call, WorkItem, is_wanted
 from fiber._runtime.workers import WorkerHandle
@@ -46,11 +48,13 @@ class BatchSender:
         background: BackgroundThread,
         scheduler: Scheduler,
         jobs: Jobs,
+        activity: PoolActivity,
         *,
         advance: Callable[[], None],
     ) -> None:
         self._loop = loop
         self._background = background
+        self._activity = activity
         self._ledger = scheduler.ledger
         self._jobs = jobs
         self._advance = advance
@@ -74,16 +78,18 @@ class BatchSender:
             except RuntimeError as error:  # the system has no room for its thread
                 self._unsendable(batch, error)
             return
+        began = time.perf_counter()
         try:
             encoded = _encode(item, batch, plain=True)
         except Exception as error:  # no memory
             self._unsendable(batch, error)
         else:
-            self._deliver(item, batch, encoded)
+            self._deliver(item, batch, encoded, time.perf_counter() - began)
 
     def _encode(self, item: WorkItem, batch: Batch) -> None:
         encoded: Encoded | None = None
         error: BaseException | None = None
+        began = time.perf_counter()
         if batch.job is not None:
             try:
                 try:
@@ -92,22 +98,28 @@ class BatchSender:
                     error = _blame_items(item, batch, raised)
             except BaseException as raised:  # the user's pickler may raise anything
                 error = raised
-        self._loop.call_soon(self._encoded, item, batch, encoded, error)
+        seconds = time.perf_counter() - began
+        self._loop.call_soon(self._encoded, item, batch, encoded, error, seconds)
 
     def _encoded(
-        self, item: WorkItem, batch: Batch, encoded: Encoded | None, error: BaseException | None
+        self,
+        item: WorkItem,
+        batch: Batch,
+        encoded: Encoded | None,
+        error: BaseException | None,
+        seconds: float,
     ) -> None:
         if self._ledger.batches.get(batch.seq) is not batch:
             return  # its worker is gone
         if batch.job is None:  # cancelled
             self.reassign(batch)
         elif encoded is not None:
-            self._deliver(item, batch, encoded)
+            self._deliver(item, batch, encoded, seconds)
         elif error is not None:
             self._unsendable(batch, error)
         self._advance()
 
-    def _deliver(self, item: WorkItem, batch: Batch, encoded: Encoded) -> None:
+    def _deliver(self, item: WorkItem, batch: Batch, encoded: Encoded, pickling: float) -> None:
         handle: WorkerHandle = batch.worker.key
         assert handle.child is not None
         seq = batch.seq
@@ -115,7 +127,9 @@ class BatchSender:
             self._limits.begin(seq, item.timeout)
         sent = self._functions.setdefault(batch.worker, {})
         try:
-            taken = handle.child.deliver(seq, *_pack(item, batch, encoded, sent))
+            data, buffers = _pack(item, batch, encoded, sent)
+            self._activity.sent(pickling, data, buffers)
+            taken = handle.child.deliver(seq, data, buffers)
         except Exception as error:  # the system has no memory or descriptor for it
             self._unsendable(batch, error)
             return
@@ -337,6 +351,7 @@ class AnswerReceiver:
         jobs: Jobs,
         sender: BatchSender,
         leases: Leases,
+        activity: PoolActivity,
         *,
         advance: Callable[[], None],
         on_ready: Callable[[WorkerHandle], None],
@@ -348,6 +363,7 @@ class AnswerReceiver:
         self._jobs = jobs
         self._sender = sender
         self._leases = leases
+        self._activity = activity
         self._advance = advance
         self._on_ready = on_ready
 
@@ -411,10 +427,12 @@ class AnswerReceiver:
         seq, offset, kept, seconds, values, mixed, size = results
         if handle.worker is None:
             raise WrongAnswer(_NOT_READY.format(seq))
+        since = handle.worker.since
         receipt = self._ledger.receive(
             handle.worker, seq, offset, len(values), self._loop.now(), seconds=seconds, kept=kept
         )
         handle.did(len(values))
+        self._activity.answered(handle, since, receipt, (seconds, values, mixed, size))
         self._scheduler.workers.did_something()
         self._sender.settled(seq)
         if receipt is not None:

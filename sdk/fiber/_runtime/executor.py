@@ -37,6 +37,7 @@ from fiber._runtime.exchange import AnswerReceiver, BatchSender
 from fiber._runtime.jobs import TICK, CallQueue, Calls, Jobs
 from fiber._runtime.leases import ADOPTED, UNAVAILABLE, LeasedWorker, Leases
 from fiber._runtime.options import PoolOptions
+from fiber._runtime.pool_activity import PoolActivity
 from fiber._runtime.pool_state import PoolState, pool_state
 from fiber._runtime.state import Runtime
 from fiber._runtime.threads import BackgroundThread, Latch, UserThreads, say
@@ -89,12 +90,15 @@ class PoolExecutor:
         )
         self._ledger = self._scheduler.ledger
         self.workers = WorkerView(self._scheduler.workers, runtime.loop)
-        self._jobs = Jobs(self._ledger, options.limits, retry=bool(options.retryable))
+        self._activity = PoolActivity(runtime.activity, runtime.loop)
+        retry = bool(options.retryable)
+        self._jobs = Jobs(self._ledger, options.limits, self._activity, retry=retry)
         self._sender = BatchSender(
             self._loop,
             self._background,
             self._scheduler,
             self._jobs,
+            self._activity,
             advance=self._advance,
         )
         self._resources = WorkerResources(options.resources)
@@ -106,7 +110,7 @@ class PoolExecutor:
             on_failed=self._never_started,
         )
         self._leases = Leases(
-            self._scheduler, self._loop, on_adopted=self._adopt, on_back=self._back
+            self._scheduler, self._loop, self._activity, on_adopted=self._adopt, on_back=self._back
         )
         self._receiver = AnswerReceiver(
             self._loop,
@@ -115,6 +119,7 @@ class PoolExecutor:
             self._jobs,
             self._sender,
             self._leases,
+            self._activity,
             advance=self._advance,
             on_ready=self._ready,
         )
@@ -133,8 +138,6 @@ class PoolExecutor:
         """Error of calls that are not done when the pool is terminated."""
         self._acting = False
         self._again = False
-        self._done_before = 0
-        """Number of tasks that workers did which are gone."""
 
     # Requests, on any thread
 
@@ -389,9 +392,8 @@ class PoolExecutor:
 
     def describe(self) -> PoolState:
         """Return the state of the pool, for monitors."""
-        return pool_state(
-            self._ledger, self._scheduler.workers, self._done_before, self._loop.now()
-        )
+        done_before = self._activity.done_before
+        return pool_state(self._ledger, self._scheduler.workers, done_before, self._loop.now())
 
     # Decisions
 
@@ -503,6 +505,7 @@ class PoolExecutor:
     def _ready(self, handle: WorkerHandle) -> None:
         """Give tasks to a worker that is initialized."""
         _logs.debug("worker %s is ready", handle.name)
+        self._activity.ready(handle)
         self._scheduler.ready(handle, self._loop.now())
         self.workers.changed()
         self._advance()
@@ -531,7 +534,6 @@ class PoolExecutor:
     def _lost(
         self, handle: WorkerHandle, failure: StartFailure | None, report: ExitReport | None = None
     ) -> None:
-        self._done_before += handle.tasks
         now = self._loop.now()
         unread: set[int] = set()
         running = None
@@ -543,9 +545,10 @@ class PoolExecutor:
             running = report.running
             if running is not None:
                 unread.discard(running[0])
-        losses = self._scheduler.gone(
-            handle, now, unread=unread, running=running, disrupted=disrupted, failure=failure
-        )
+        with self._activity.losing(handle, handle.worker):
+            losses = self._scheduler.gone(
+                handle, now, unread=unread, running=running, disrupted=disrupted, failure=failure
+            )
         self.workers.changed()
         if report is not None:
             self._jobs.put_losses(losses, handle.name, handle.pid, report)

@@ -17,6 +17,7 @@ from fiber._engine.ledger import Ledger
 from fiber._engine.scheduler import Scheduler
 from fiber._engine.tasks import Job, Limits, Loss, Receipt, WorkerEntry
 from fiber._runtime.answers import Pickled, TaskFailure
+from fiber._runtime.pool_activity import PoolActivity
 from fiber._runtime.work_items import Call, WorkItem, is_wanted
 from fiber._transport.loop import Loop
 from fiber._wire import work
@@ -32,9 +33,12 @@ A rounding error could make a shorter timer fire too early, and the executor wou
 class Jobs:
     """Opens, feeds and ends jobs, and hands their outcomes to futures.  Runs on the loop thread."""
 
-    def __init__(self, ledger: Ledger, limits: Limits, *, retry: bool) -> None:
+    def __init__(
+        self, ledger: Ledger, limits: Limits, activity: PoolActivity, *, retry: bool
+    ) -> None:
         self._ledger = ledger
         self._limits = limits
+        self._activity = activity
         self._retry = retry
         self._streams: dict[WorkItem, None] = {}
 
@@ -132,7 +136,9 @@ class Jobs:
             for at, result in enumerate(results):
                 again = type(result) is Pickled and result.kind == work.AGAIN
                 index = receipt.start + at
-                if not (again and self._ledger.retry(receipt, index)):
+                if again and self._ledger.retry(receipt, index):
+                    self._activity.retried()
+                else:
                     self._put(receipt._replace(start=index), [result], True, size // len(results))
         else:
             self._put(receipt, results, mixed, size)

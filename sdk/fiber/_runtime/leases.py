@@ -25,9 +25,11 @@ from collections.abc import Callable
 from typing import Any
 
 from fiber._agent.interface import DirectChannel, ExitReport
+from fiber._engine.activity import WorkReport
 from fiber._engine.scheduler import Scheduler
 from fiber._engine.tasks import WrongAnswer
-from fiber._runtime.answers import OTHER, MessageFields, read, single
+from fiber._runtime.answers import OTHER, MessageFields, is_failure, read, single
+from fiber._runtime.pool_activity import PoolActivity
 from fiber._runtime.work_items import Call
 from fiber._runtime.workers import WorkerHandle
 from fiber._transport.loop import Loop, LoopTimer
@@ -58,10 +60,30 @@ ADOPTED = NoOutcome()
 class LeasedWorker:
     """Record of a leased worker while a caller uses it.  Only ``Leases`` changes it."""
 
-    __slots__ = ("answer", "draining", "handle", "report", "seq", "unread")
+    __slots__ = (
+        "answer",
+        "calls",
+        "draining",
+        "failed",
+        "function",
+        "handle",
+        "noted",
+        "report",
+        "seconds",
+        "seq",
+        "unread",
+    )
 
-    def __init__(self, handle: WorkerHandle) -> None:
+    def __init__(self, handle: WorkerHandle, now: float) -> None:
         self.handle = handle
+        self.function = ""
+        """Function of the last call that it answered."""
+        self.calls = self.failed = 0
+        """Calls that it answered.  Only the caller writes to these, and the loop reads them."""
+        self.seconds = 0.0
+        """Seconds of work for these calls."""
+        self.noted = (now, 0, 0, 0.0)
+        """Time of the last note; then ``calls``, ``failed`` and ``seconds`` at that time."""
         self.seq = 0
         """Number of the last call that a caller sent it."""
         self.answer: MessageFields | None = None
@@ -72,6 +94,25 @@ class LeasedWorker:
         """End of the worker."""
         self.draining = False
         """True if the worker's host is about to end."""
+
+    def did(self, function: str, seconds: float, failed: bool) -> None:
+        """Count a call that it has answered.  Runs on the caller's thread."""
+        self.handle.did(1)
+        self.function = function
+        self.seconds += seconds
+        self.failed += failed
+        self.calls += 1
+
+    def take_work(self, now: float) -> WorkReport | None:
+        """Return the work since the last note, and note it; None if there was none."""
+        before, calls_before, failed_before, seconds_before = self.noted
+        calls, failed, seconds = self.calls, self.failed, self.seconds
+        if calls == calls_before:
+            return None
+        self.noted = now, calls, failed, seconds
+        work, tasks = seconds - seconds_before, calls - calls_before
+        begin = max(before, min(now - work, now - UNUSED))
+        return WorkReport(self.function, begin, now, work, tasks, failed - failed_before)
 
 
 class Lease:
@@ -99,11 +140,13 @@ class Leases:
         self,
         scheduler: Scheduler,
         loop: Loop,
+        activity: PoolActivity,
         *,
         on_adopted: Callable[[LeasedWorker, Call], None],
         on_back: Callable[[LeasedWorker], None],
     ) -> None:
         self._scheduler = scheduler
+        self._activity = activity
         self._batches = scheduler.ledger.batches
         self._loop = loop
         self._on_adopted = on_adopted
@@ -151,13 +194,13 @@ class Leases:
                 return ADOPTED
             if message is None:
                 return ADOPTED
-            result = single(message, seq)
+            result, seconds = single(message, seq)
             if result is OTHER and not self._is_late(message, seq):
                 lease.unexpected = message
                 return ADOPTED
             message.release()
             if result is not OTHER:
-                lease.worker.handle.did(1)
+                lease.worker.did(call.name, seconds, is_failure(result))
                 return result
 
     def _is_late(self, message: Message, seq: int) -> bool:
@@ -186,7 +229,7 @@ class Leases:
         if channel is None:
             self._scheduler.return_idle(handle.worker, self._loop.now())
             return
-        self._workers[handle] = worker = LeasedWorker(handle)
+        self._workers[handle] = worker = LeasedWorker(handle, self._loop.now())
         lease = Lease(worker, channel)
         self._leases[weakref.ref(lease, self._dropped.append)] = worker
         self._recalled = False
@@ -257,6 +300,8 @@ class Leases:
     def _recall_unused(self) -> None:
         """End the leases that no caller used since this was called last."""
         self._check = None
+        for worker in self._leases.values():
+            self._note(worker)
         for lease in list(self._idle):
             if not lease.used:
                 self._recall_one(lease.worker.handle)
@@ -313,7 +358,14 @@ class Leases:
         if handle.child is not None:
             handle.child.reclaim()
 
+    def _note(self, worker: LeasedWorker) -> None:
+        """Note the calls of a leased worker in the pool's activity."""
+        work = worker.take_work(self._loop.now())
+        if work is not None:
+            self._activity.leased(worker.handle, work)
+
     def _back(self, worker: LeasedWorker) -> None:
+        self._note(worker)
         if self._workers.get(worker.handle) is worker:
             del self._workers[worker.handle]
         self._on_back(worker)

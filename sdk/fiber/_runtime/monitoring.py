@@ -5,6 +5,8 @@ what follows:
 
 ``state``     ``{"pool": …}`` for each pool (``PoolState``), ``{"child": …}`` for each child, and
               ``{"death": …}`` for the last children that ended by themselves
+``activity``  ``{"activity": …}``, a snapshot of ``Activity``; with ``since``, what has changed
+              after the snapshot of that revision
 ``stacks``    ``{"stack": …}`` for the program itself and for each child, as the answers come.  With
               ``worker``, only for the child of that name or pid, or for the children on that host
 """
@@ -23,6 +25,7 @@ from functools import partial
 from types import FrameType
 from typing import Any, TypeVar, cast
 
+from fiber._engine.activity import Activity, ChildRecord
 from fiber._runtime.children import Child, Children
 from fiber._runtime.pool_state import WatchedPool
 from fiber._transport.loop import Loop
@@ -46,12 +49,14 @@ class Monitor:
     def __init__(
         self,
         loop: Loop,
+        activity: Activity,
         children: Children,
         pools: Iterable[WatchedPool],
         backend: str,
         config: Config,
     ) -> None:
         self._loop = loop
+        self._activity = activity
         self._children = children
         self._pools = pools
         self._backend = backend
@@ -63,6 +68,8 @@ class Monitor:
         ask = request.get("ask")
         if ask == "state":
             yield from self._on_loop(self._state)
+        elif ask == "activity":
+            yield {"activity": self._on_loop(partial(self._snapshot, request.get("since", 0)))}
         elif ask == "stacks":
             yield from self._stacks(request.get("worker"))
         elif ask is not None:
@@ -90,8 +97,24 @@ class Monitor:
     def _state(self) -> list[dict[str, Any]]:
         pools = [{"pool": pool.describe()._asdict()} for pool in list(self._pools)]
         children = [{"child": facts} for facts in self._describe_children()]
-        deaths = [{"death": death._asdict()} for death in self._children.deaths]
+        deaths = [{"death": self._death(record)} for record in self._activity.deaths]
         return [*pools, *children, *deaths]
+
+    def _death(self, record: ChildRecord) -> dict[str, Any]:
+        ago = self._loop.now() - (record.ended or 0.0)
+        return {
+            "time": time.time() - ago,
+            "name": record.name,
+            "host": record.host,
+            "pid": record.pid,
+            "reason": record.reason,
+        }
+
+    def _snapshot(self, since: int) -> dict[str, Any]:
+        """Return the program's activity; ``start`` is the unix time of its beginning."""
+        now = self._loop.now()
+        start = time.time() - (now - self._activity.start)
+        return {"start": start, **self._activity.snapshot(now, since)}
 
     def _describe_children(self) -> list[dict[str, Any]]:
         return [_facts(child) for child in self._children]

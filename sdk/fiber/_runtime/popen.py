@@ -10,6 +10,7 @@ from multiprocessing.process import BaseProcess
 from fiber import _logs
 from fiber._agent.interface import UNKNOWN, ChildHandle, ExitReport
 from fiber._agent.last_words import TELL
+from fiber._engine.activity import ChildRecord
 from fiber._exceptions import fresh
 from fiber._runtime.state import runtime
 from fiber._runtime.threads import Latch
@@ -30,6 +31,7 @@ class Popen:
         self._on_exit = on_exit
         self.returncode: int | None = None
         self.report: ExitReport | None = None
+        self.record: ChildRecord | None = None
         self._pid: int | None = None
         self._child: ChildHandle | None = None
         self._may_wait = runtime().backend.elastic

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 from fiber import _config_sources, _logs, config, reduction
 from fiber._agent import child
 from fiber._agent.interface import ChildHandle, ChildSpec
+from fiber._engine.activity import Activity
 from fiber._hub import client as hub_client
 from fiber._hub.handles import collecting_grants
 from fiber._hub.hub import Hub
@@ -54,7 +55,9 @@ class Runtime:
         self.loop = Loop()
         self.host = child.host or "local"
         self.hub: Hub | None = None
-        self.children = Children()
+        self.activity = Activity(self.loop.now())
+        """Record of what the children did."""
+        self.children = Children(self.activity, self.loop.now)
         self.pools: weakref.WeakSet[WatchedPool] = weakref.WeakSet()
         """Executors with workers.  Only the loop thread adds and removes them."""
         self._monitor: MonitorServer | None = None
@@ -160,7 +163,9 @@ class Runtime:
     def _answer_monitor(self, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
         from fiber._runtime.monitoring import Monitor  # rarely needed
 
-        monitor = Monitor(self.loop, self.children, self.pools, self.backend.name, self.config)
+        monitor = Monitor(
+            self.loop, self.activity, self.children, self.pools, self.backend.name, self.config
+        )
         return monitor.answer(request)
 
     def _preparation(self, process: Any, *, anew: bool) -> tuple[bytes, PackedProgram | None]:

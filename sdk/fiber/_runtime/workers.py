@@ -13,6 +13,7 @@ from fiber import _logs, _worker_images
 from fiber._agent import worker
 from fiber._agent.interface import Cause, ChildHandle, ExitReport
 from fiber._agent.last_words import TELL
+from fiber._engine.activity import ChildRecord
 from fiber._engine.scheduler import PoolWorkerSet
 from fiber._engine.start_failures import StartFailure
 from fiber._engine.tasks import WorkerEntry
@@ -89,6 +90,7 @@ class WorkerHandle:
         self.child: ChildHandle | None = None
         self.worker: WorkerEntry | None = None
         """Entry of the worker in the ledger, once it is ready."""
+        self.record: ChildRecord | None = None
         self.init_error = ""
         """Error of its initializer, or of its start."""
         self.fault = ""
