@@ -115,6 +115,9 @@ class FakeChild:
         """Return no tasks: the worker has run what was delivered, or is about to."""
         self._agent.loop.call_soon(self._observer.recalled, [])
 
+    def measure(self) -> None:
+        """Do nothing."""
+
     def signal(self, signum: int) -> None:
         """End the child by the signal."""
         self._agent.loop.call_soon(self._end, ExitReport(-signum, "killed"))

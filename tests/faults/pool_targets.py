@@ -121,3 +121,14 @@ def hang_in_native_code() -> None:
 def crash(signum: int) -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     os.kill(os.getpid(), signum)
+
+
+kept: list[bytes] = []
+
+
+def keep_memory(size: int) -> None:
+    kept.append(b"x" * size)
+
+
+def divide(dividend: float, divisor: float) -> float:
+    return dividend / divisor

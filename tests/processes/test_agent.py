@@ -127,6 +127,18 @@ def test_a_signal_to_an_ended_child_does_nothing(shared: Agent) -> None:
     assert observer.events == ["started", "exited"]
 
 
+def test_a_child_is_measured_while_it_runs(shared: Agent) -> None:
+    child, observer = begin(shared, run_forever)
+    observer.wait_for_start()
+    child.measure()
+    (usage,) = observer.usages
+    assert usage.memory > 1 << 20
+    assert usage.cpu >= 0
+    end(child, observer)
+    child.measure()
+    assert len(observer.usages) == 1
+
+
 def test_work_goes_out_and_answers_come_back(shared: Agent) -> None:
     child, observer = begin(shared, answer_sums, tasks=True)
     large = bytes(100_000)

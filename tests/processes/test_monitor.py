@@ -170,6 +170,58 @@ def test_the_state_of_a_pool_counts_its_tasks(pool: Pool) -> None:
     assert task["seconds"] >= 0
 
 
+def test_the_state_has_the_memory_and_processor_time_of_children(pool: Pool) -> None:
+    pool.apply(tasks.keep_memory, (64 << 20,))
+
+    def grown() -> bool:
+        (child,) = state()["child"]
+        return (child["memory"] or 0) > 64 << 20 and child["cpu"] > 0
+
+    assert wait_until(grown, PATIENCE)
+
+
+def activity(since: int = 0) -> dict[str, Any]:
+    (line,) = ask(ask="activity", since=since)
+    found: dict[str, Any] = line["activity"]
+    return found
+
+
+def test_the_activity_agrees_with_what_ran(pool: Pool) -> None:
+    before = activity()
+    assert pool.map(abs, range(1000), chunksize=1) == list(range(1000))
+    calls = [pool.apply_async(tasks.divide, (1, number)) for number in range(5)]
+    with pytest.raises(ZeroDivisionError):
+        calls[0].get()
+    assert [call.get() for call in calls[1:]] == [1, 1 / 2, 1 / 3, 1 / 4]
+    for number in range(20):
+        pool.apply(round, (number,))
+
+    def counts() -> dict[str, tuple[int, int]]:
+        known = {one["name"]: one for one in before["functions"]}
+        zero = {"tasks": 0, "failed": 0}
+        return {
+            one["name"]: tuple(one[key] - known.get(one["name"], zero)[key] for key in zero)
+            for one in activity()["functions"]
+        }
+
+    expected = {"abs": (1000, 0), "divide": (5, 1), "round": (20, 0)}
+    assert wait_until(lambda: counts().items() >= expected.items(), PATIENCE)
+    now = activity()
+    (child,) = [child for child in now["children"] if child["ended"] is None]
+    assert (child["tasks"], child["failed"]) == (1025, 1)
+    assert sum(span[4] for span in child["spans"]) == 1025
+    assert 0 < child["work"] <= now["now"]
+    assert now["bytes_sent"] > before["bytes_sent"]
+    assert now["bytes_received"] > before["bytes_received"]
+
+
+def test_lost_runs_are_counted(pool: Pool) -> None:
+    before = activity()["lost"]
+    with pytest.raises(fiber.WorkerDied):
+        pool.apply(tasks.die)
+    assert activity()["lost"] == before + 4
+
+
 def test_tasks_of_workers_that_are_gone_still_count(pool: Pool) -> None:
     for number in range(3):
         pool.apply(abs, (number,))

@@ -200,6 +200,9 @@ class Child:
         self.agent.world.note("%s is asked for its unread batches", self.name)
         self.agent.down.send(self._recall)
 
+    def measure(self) -> None:
+        """Do nothing: simulated children use nothing."""
+
     def signal(self, signum: int) -> None:
         """Send it a signal; each one is deadly here."""
         self.agent.down.send(self.worker.die, -signum)

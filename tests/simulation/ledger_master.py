@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 from fiber._agent.interface import ExitReport
+from fiber._agent.usage import Usage
 from fiber._engine import tasks as engine
 from fiber._engine.chunks import TaskPace
 from fiber._engine.ledger import Ledger
@@ -65,6 +66,9 @@ class Member:
     def recalled(self, seqs: list[int]) -> None:
         """Take back the packets that it did not read."""
         self._master.recalled(self, seqs)
+
+    def measured(self, usage: Usage) -> None:
+        """Take its memory and processor time."""
 
     def showed_stack(self, text: str) -> None:
         """Take its stacks."""

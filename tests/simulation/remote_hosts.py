@@ -13,6 +13,7 @@ from unittest import mock
 
 from fiber._agent import service
 from fiber._agent.interface import ChildObserver, ChildSpec, ExitReport
+from fiber._agent.usage import Usage
 from fiber._backends.remote import RemoteAgent, RemoteChild
 from fiber._wire.packet import Message
 from memory_link import Cable
@@ -153,6 +154,10 @@ class Seen:
     def recalled(self, seqs: list[int]) -> None:
         """Take back the packets that it did not read."""
         self._observer.recalled(seqs)
+
+    def measured(self, usage: Usage) -> None:
+        """Take its memory and processor time."""
+        self._observer.measured(usage)
 
     def showed_stack(self, text: str) -> None:
         """Take its stacks."""

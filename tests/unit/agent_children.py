@@ -10,6 +10,7 @@ from typing import Any, NoReturn
 
 from fiber._agent import child
 from fiber._agent.interface import ExitReport
+from fiber._agent.usage import Usage
 from fiber._transport.link import LinkObserver
 from fiber._transport.link_protocol import Lane
 from fiber._wire import messages, packet
@@ -23,6 +24,7 @@ class Recorder:
     def __init__(self) -> None:
         self.events: list[str] = []
         self.words: list[Any] = []
+        self.usages: list[Usage] = []
         self.unread: list[int] | None = None
         self.pid: int | None = None
         self.report: ExitReport | None = None
@@ -39,6 +41,10 @@ class Recorder:
     def recalled(self, seqs: list[int]) -> None:
         self.unread = seqs
         self._note("taken back")
+
+    def measured(self, usage: Usage) -> None:
+        self.usages.append(usage)
+        self._note("measured")
 
     def showed_stack(self, text: str) -> None:
         self.words.append(text)

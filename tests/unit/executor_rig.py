@@ -147,6 +147,9 @@ class FakeChild:
     def signal(self, signum: int) -> None:
         self.signals.append(signum)
 
+    def measure(self) -> None:
+        pass
+
     def lease_channel(self) -> None:
         """Do nothing: no caller uses it directly."""
 

@@ -22,6 +22,8 @@ from fiber._wire.messages import (
     Lacking,
     Leave,
     LinkMessage,
+    Measure,
+    Measured,
     ProtocolError,
     Recall,
     Recalled,
@@ -57,6 +59,8 @@ messages: st.SearchStrategy[LinkMessage] = st.one_of(
     st.builds(Deliver, ids, ids, data, buffers),
     st.builds(FromChild, ids, data, buffers),
     st.builds(Recall, ids),
+    st.builds(Measure, ids),
+    st.builds(Measured, ids, ids, ids),
     st.builds(Recalled, ids, st.lists(ids).map(tuple)),
     st.builds(
         Exited,

@@ -18,7 +18,7 @@ def child(host: str, state: str = "busy") -> dict[str, Any]:
 
 def sample(at: float = 0.0, **found: Any) -> Sample:
     facts = {"name": "train-1", "command": "train.py", "started": time.time(), "backend": "local"}
-    parts = {"programs": [facts], "pools": [], "children": [], "deaths": []}
+    parts = {"programs": [facts], "pools": [], "children": [], "deaths": [], "totals": []}
     return Sample(at, **(parts | found))
 
 
@@ -47,10 +47,27 @@ def test_the_tasks_of_all_pools_are_added_up() -> None:
 def test_workers_are_counted_by_host_and_state() -> None:
     children = [child("a"), child("a", "idle"), child("b"), child("", "waiting")]
     text = frame(sample(children=children), None)
-    assert line_with(text, "HOST") == ["HOST", "BUSY", "IDLE", "WAITING"]
+    assert line_with(text, "HOST") == ["HOST", "BUSY", "IDLE", "WAITING", "MEMORY", "CPUS"]
     assert line_with(text, "all ") == ["all", "2", "1", "1"]
     assert line_with(text, "a  ") == ["a", "1", "1"]
     assert "(no host yet)" in text
+
+
+def test_memory_and_processors_of_a_host_are_added_up() -> None:
+    def used(pid: int, memory: int, cpu: float) -> dict[str, Any]:
+        return {**child("a"), "pid": pid, "memory": memory, "cpu": cpu}
+
+    first = sample(1.0, children=[used(1, 1 << 20, 5.0), used(2, 1 << 20, 7.0)])
+    second = sample(3.0, children=[used(1, 3 << 20, 7.0), used(2, 1 << 20, 8.0), used(3, 0, 9.0)])
+    assert line_with(frame(first, None), "a  ") == ["a", "2", "2.0", "MiB"]
+    assert line_with(frame(second, first), "a  ") == ["a", "3", "4.0", "MiB", "1.5"]
+
+
+def test_losses_are_shown_when_there_are_some() -> None:
+    totals = {"failed": 2, "retried": 0, "lost": 1, "bytes_sent": 2048, "bytes_received": 10}
+    text = frame(sample(totals=[totals, totals]), None)
+    assert "failed: 4   lost: 2   sent: 4.0 KiB   received: 20 B" in text
+    assert "retried" not in text
 
 
 def test_of_many_hosts_the_largest_are_shown() -> None:
@@ -62,12 +79,19 @@ def test_of_many_hosts_the_largest_are_shown() -> None:
 
 def test_the_tasks_that_run_for_longest_come_first() -> None:
     tasks = [
-        {"task": f"task {number} of f()", "worker": f"w{number}", "host": "h", "seconds": number}
+        {
+            "task": f"task {number} of f()",
+            "worker": f"w{number}",
+            "host": "h",
+            "seconds": number,
+            "argument": f"argument {number}",
+        }
         for number in range(30)
     ]
     text = frame(sample(pools=[pool(slowest=tasks[:20]), pool(slowest=tasks[20:])]), None)
     shown = [line.split()[1] for line in text.splitlines() if " of f()" in line]
     assert shown == [f"w{number}" for number in range(29, 19, -1)]
+    assert line_with(text, "w29")[-2:] == ["argument", "29"]
 
 
 def test_the_last_deaths_are_shown() -> None:

@@ -27,6 +27,7 @@ from fiber._agent.child import StartRequest, lineage
 from fiber._agent.interface import OUT_OF_MEMORY, Cause, ChildObserver, ChildSpec, ExitReport
 from fiber._agent.last_words import MemoryLimit, ProgressTable, describe
 from fiber._agent.preload import Imports
+from fiber._agent.usage import usage_of
 from fiber._agent.zygote_link import ZygoteLink
 from fiber._agent.zygote_process import is_standard_stream
 from fiber._hub import client as hub_client
@@ -455,6 +456,12 @@ class LocalChild:
             self._signal(signum)  # the loop runs no calls
         else:
             self._loop.call_soon(self._signal, signum)
+
+    def measure(self) -> None:
+        """Report the child's memory and processor time to the observer, if it runs."""
+        usage = None if self.pid is None else usage_of(self.pid)
+        if usage is not None:
+            self.observer.measured(usage)
 
     def _signal(self, signum: int) -> None:
         if self.zygote is not None:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import NamedTuple, Protocol
 
+from fiber._agent.usage import Usage
 from fiber._wire.descriptor import Descriptor
 from fiber._wire.memory_files import Blob, BytesLike
 from fiber._wire.packet import Message
@@ -124,6 +125,9 @@ class ChildObserver(Protocol):
     def showed_stack(self, text: str) -> None:
         """Take the Python stacks of the child, which got the signal ``last_words.SHOW``."""
 
+    def measured(self, usage: Usage) -> None:
+        """Take the answer to ``measure``."""
+
     def draining(self) -> None:
         """Take note that the child's host is about to end: send the child no more tasks."""
 
@@ -197,6 +201,9 @@ class ChildHandle(Protocol):
 
     def signal(self, signum: int) -> None:
         """Send the child a signal, unless it is gone."""
+
+    def measure(self) -> None:
+        """Measure the child, if it runs; ``measured`` gets the answer.  Runs on the loop thread."""
 
 
 class Backend(Protocol):

@@ -20,6 +20,7 @@ from fiber import config
 from fiber._agent.agent import Agent, LocalChild
 from fiber._agent.interface import Cause, ChildSpec, ExitReport
 from fiber._agent.last_words import TELL, signal_masks
+from fiber._agent.usage import Usage
 from fiber._hub.hub import Hub
 from fiber._transport.channels import naming_the_limit
 from fiber._transport.link import Link
@@ -89,7 +90,7 @@ class AgentService:
             self.stop("the master ended", message.grace)
         elif isinstance(message, messages.HubMessage):
             self._hub_link.on_frame(message)
-        elif isinstance(message, messages.Deliver | messages.Signal | messages.Recall):
+        elif isinstance(message, messages.ChildRequest):
             child = self._children.get(message.child)
             if child is not None:  # otherwise the child ended while the message travelled
                 child.handle(message)
@@ -239,7 +240,7 @@ class _Observed:
         elif child.pid is not None and is_expected(child.pid, signal.SIGTERM):
             child.signal(signal.SIGTERM)
 
-    def handle(self, message: messages.Deliver | messages.Signal | messages.Recall) -> None:
+    def handle(self, message: messages.ChildRequest) -> None:
         """Do what a message of the master asks of this child."""
         child = self._child
         if child is None:
@@ -258,6 +259,8 @@ class _Observed:
                 child.abort(error)
         elif isinstance(message, messages.Signal):
             child.signal(message.signum)
+        elif isinstance(message, messages.Measure):
+            child.measure()
         else:
             child.recall()
 
@@ -286,6 +289,11 @@ class _Observed:
     def showed_stack(self, text: str) -> None:
         """Send the child's stacks to the master."""
         self._service.send(messages.ShownStack(self._number, text))
+
+    def measured(self, usage: Usage) -> None:
+        """Send the child's memory and processor time to the master."""
+        milliseconds = round(usage.cpu * 1000)
+        self._service.send(messages.Measured(self._number, usage.memory, milliseconds))
 
     def draining(self) -> None:
         """Do nothing: this agent itself tells the master that its host is about to end."""

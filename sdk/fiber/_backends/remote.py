@@ -18,6 +18,7 @@ from functools import lru_cache, partial
 from typing import Protocol
 
 from fiber._agent.interface import OUT_OF_MEMORY, Cause, ChildObserver, ChildSpec, ExitReport
+from fiber._agent.usage import Usage
 from fiber._hub.hub import Hub
 from fiber._logs import OutputWriter
 from fiber._transport.link import Link
@@ -342,6 +343,10 @@ class RemoteChild:
         """Send the child a signal."""
         self._loop.call_soon(self._ask, messages.Signal, signum)
 
+    def measure(self) -> None:
+        """Ask the child's agent to measure the child."""
+        self._ask(messages.Measure)
+
     def _ask(self, message: Callable[..., messages.LinkMessage], *fields: int) -> None:
         if self._gone:
             return
@@ -375,6 +380,8 @@ class RemoteChild:
             self.observer.recalled(list(message.seqs))
         elif isinstance(message, messages.ShownStack):
             self.observer.showed_stack(message.text)
+        elif isinstance(message, messages.Measured):
+            self.observer.measured(Usage(message.memory, message.milliseconds / 1000))
         elif isinstance(message, messages.ChildOutput):
             output.write(f"{self.name}@{self.host}", message.text)
         elif isinstance(message, messages.Exited) and self._may_begin_elsewhere(message):

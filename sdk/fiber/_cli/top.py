@@ -83,6 +83,7 @@ def _sample(name: str, context: str | None, namespace: str | None) -> Sample:
         found.get("pool", []),
         found.get("child", []),
         found.get("death", []),
+        found.get("totals", []),
     )
 
 

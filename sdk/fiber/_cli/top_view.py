@@ -32,16 +32,22 @@ class Sample(NamedTuple):
     pools: list[dict[str, Any]]
     children: list[dict[str, Any]]
     deaths: list[dict[str, Any]]
+    totals: list[dict[str, Any]]
+    """Totals of each of the programs."""
 
     @property
     def done(self) -> int:
         """Tasks that are done."""
         return sum(pool["done"] for pool in self.pools)
 
+    def total(self, name: str) -> float:
+        """Return the sum of a total over the programs."""
+        return sum(float(totals[name]) for totals in self.totals)
+
 
 def frame(sample: Sample, before: Sample | None) -> str:
     """Return the text for a sample; ``before`` is the sample before it."""
-    parts = [_head(sample), _counts(sample, before), _workers(sample), _slowest(sample)]
+    parts = [_head(sample), _counts(sample, before), _workers(sample, before), _slowest(sample)]
     parts.append(_deaths(sample))
     return "\n\n".join(part for part in parts if part)
 
@@ -61,6 +67,9 @@ def _counts(sample: Sample, before: Sample | None) -> str:
         ("with workers", str(sum(pool["held"] for pool in sample.pools))),
         ("waiting", str(sum(pool["waiting"] for pool in sample.pools))),
     ]
+    counted = [(name, int(sample.total(name))) for name in ("failed", "retried", "lost")]
+    facts += [(name, str(count)) for name, count in counted if count]
+    facts += [(word, display.size(sample.total(f"bytes_{word}"))) for word in ("sent", "received")]
     return "   ".join(f"{name}: {value}" for name, value in facts)
 
 
@@ -71,31 +80,73 @@ def _rate(sample: Sample, before: Sample | None) -> str:
     return f"{(sample.done - before.done) / (sample.time - before.time):.1f}"
 
 
-def _workers(sample: Sample) -> str:
-    """Return a table: for each host, its processes by state."""
-    hosts: dict[str, Counter[str]] = {}
+class HostFacts:
+    """Processes of a host by state, and what they use."""
+
+    def __init__(self) -> None:
+        self.states: Counter[str] = Counter()
+        self.memory = 0
+        self.cpu = 0.0
+        """Processors at work."""
+
+    def add(self, child: dict[str, Any], cpu: float) -> None:
+        """Count a process."""
+        self.states[child["state"]] += 1
+        self.memory += child.get("memory") or 0
+        self.cpu += cpu
+
+
+def _busy_processors(sample: Sample, before: Sample | None) -> dict[tuple[str, int], float]:
+    """Return the processors that each process kept busy between two samples."""
+    if before is None or sample.time <= before.time:
+        return {}
+    first, last = (
+        {_key(c): c["cpu"] for c in one.children if c.get("cpu") is not None}
+        for one in (before, sample)
+    )
+    seconds = sample.time - before.time
+    return {key: max(0.0, last[key] - first[key]) / seconds for key in first.keys() & last.keys()}
+
+
+def _key(child: dict[str, Any]) -> tuple[str, int]:
+    return child["host"], child["pid"]
+
+
+def _workers(sample: Sample, before: Sample | None) -> str:
+    """Return a table: for each host, its processes by state, their memory and processors."""
+    busy = _busy_processors(sample, before)
+    hosts: dict[str, HostFacts] = {}
+    total = HostFacts()
     for child in sample.children:
         host = child["host"] or "(no host yet)"
-        hosts.setdefault(host, Counter())[child["state"]] += 1
+        for facts in (hosts.setdefault(host, HostFacts()), total):
+            facts.add(child, busy.get(_key(child), 0.0))
     if not hosts:
         return "no process or worker runs"
-    columns = [state for state in _STATES if any(counts[state] for counts in hosts.values())]
-    total: Counter[str] = sum(hosts.values(), Counter())
-    rows = sorted(hosts.items(), key=lambda item: (-item[1].total(), item[0]))
+    columns = [state for state in _STATES if total.states[state]]
+    rows = sorted(hosts.items(), key=lambda item: (-item[1].states.total(), item[0]))
     shown = [("all", total), *rows[:_HOSTS]] if len(rows) > 1 else rows
-    lines = [[host, *(str(counts[state] or "") for state in columns)] for host, counts in shown]
+    lines = [
+        [
+            host,
+            *(str(facts.states[state] or "") for state in columns),
+            display.size(facts.memory) if facts.memory else "",
+            f"{facts.cpu:.1f}" if busy else "",
+        ]
+        for host, facts in shown
+    ]
     more = f"\n... and {len(rows) - _HOSTS} more hosts" if len(rows) > _HOSTS else ""
-    return display.table(lines, ["host", *columns]) + more
+    return display.table(lines, ["host", *columns, "memory", "cpus"]) + more
 
 
 def _slowest(sample: Sample) -> str:
     tasks = [task for pool in sample.pools for task in pool["slowest"]]
     tasks.sort(key=lambda task: -task["seconds"])
     rows = [
-        [f"{task['seconds']:.1f}s", task["worker"], task["host"], task["task"]]
+        [f"{task['seconds']:.1f}s", task["worker"], task["host"], task["task"], task["argument"]]
         for task in tasks[:_TASKS]
     ]
-    return display.table(rows, ["for", "worker", "host", "task"]) if rows else ""
+    return display.table(rows, ["for", "worker", "host", "task", "argument"]) if rows else ""
 
 
 def _deaths(sample: Sample) -> str:

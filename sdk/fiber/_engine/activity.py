@@ -72,11 +72,13 @@ class ChildRecord:
     __slots__ = (
         "began",
         "changed",
+        "cpu",
         "ended",
         "failed",
         "held",
         "host",
         "id",
+        "memory",
         "name",
         "node",
         "noted",
@@ -112,6 +114,10 @@ class ChildRecord:
         """Seconds in which it had tasks.  Without ``work``, they were on the way."""
         self.noted = began
         """Time up to which ``held`` counts."""
+        self.memory: int | None = None
+        """Bytes of memory when it was measured last; None before."""
+        self.cpu: float | None = None
+        """Seconds of processor time, likewise."""
         self.spans: list[WorkSpan] = []
         self.changed = 0
 
@@ -300,6 +306,18 @@ class Activity:
 
     # Reading
 
+    def totals(self) -> dict[str, Any]:
+        """Return the totals of the program as plain values."""
+        return {
+            "tasks": self.tasks,
+            "failed": self.failed,
+            "retried": self.retried,
+            "lost": self.lost,
+            "pickling": self.pickling,
+            "bytes_sent": self.bytes_sent,
+            "bytes_received": self.bytes_received,
+        }
+
     def snapshot(self, now: float, since: int = 0) -> dict[str, Any]:
         """Return the record as plain values, or what changed after the snapshot ``since``.
 
@@ -315,14 +333,8 @@ class Activity:
             "complete": complete,
             "now": now - start,
             "resolution": self.resolution,
-            "tasks": self.tasks,
-            "failed": self.failed,
-            "retried": self.retried,
-            "lost": self.lost,
+            **self.totals(),
             "forgotten": self.forgotten,
-            "pickling": self.pickling,
-            "bytes_sent": self.bytes_sent,
-            "bytes_received": self.bytes_received,
             "children": [
                 _child_facts(record, start, after)
                 for record in self._children.values()

@@ -7,6 +7,7 @@ from typing import Protocol
 
 from fiber._agent.interface import ChildHandle, ExitReport
 from fiber._agent.last_words import SHOW
+from fiber._agent.usage import Usage
 from fiber._engine.activity import Activity, ChildRecord
 from fiber._hub.handles import GrantSet
 from fiber._wire.packet import Message
@@ -58,6 +59,7 @@ class Child:
         self._children = children
         self._grants = grants
         self._askers: list[Callable[[str], None]] = []
+        self._on_measured: Callable[[], None] | None = None
 
     def begin(self, handle: ChildHandle) -> None:
         """Start the child."""
@@ -88,6 +90,19 @@ class Child:
             return
         self._askers.append(then)
         self.handle.signal(SHOW)
+
+    def measure(self, then: Callable[[], None]) -> None:
+        """Have the child measured, and call ``then`` when its record has the answer."""
+        assert self.handle is not None
+        self._on_measured = then
+        self.handle.measure()
+
+    def measured(self, usage: Usage) -> None:
+        """Note the child's memory and processor time."""
+        if self.owner.record is not None:
+            self.owner.record.memory, self.owner.record.cpu = usage
+        if self._on_measured is not None:
+            self._on_measured()
 
     def showed_stack(self, text: str) -> None:
         """Pass on the stacks to those that asked for them."""

@@ -3,8 +3,9 @@
 Each answer begins with ``{"program": …}``, the facts of the program.  The request's ``ask`` says
 what follows:
 
-``state``     ``{"pool": …}`` for each pool (``PoolState``), ``{"child": …}`` for each child, and
-              ``{"death": …}`` for the last children that ended by themselves
+``state``     ``{"totals": …}`` of the program, ``{"pool": …}`` for each pool (``PoolState``),
+              ``{"child": …}`` for each child with its memory in bytes and its seconds of processor
+              time, and ``{"death": …}`` for the last children that ended by themselves
 ``activity``  ``{"activity": …}``, a snapshot of ``Activity``; with ``since``, what has changed
               after the snapshot of that revision
 ``stacks``    ``{"stack": …}`` for the program itself and for each child, as the answers come.  With
@@ -13,6 +14,7 @@ what follows:
 
 from __future__ import annotations
 
+import contextlib
 import os
 import queue
 import re
@@ -36,6 +38,9 @@ T = TypeVar("T")
 
 _LOOP_PATIENCE = 5.0
 """Seconds in which the loop answers."""
+
+_MEASURE_PATIENCE = 1.0
+"""Seconds in which agents measure their children.  Later answers are shown the next time."""
 
 _STACK_PATIENCE = 8.0
 """Seconds in which all children have shown their stacks.  A child's agent gives up earlier."""
@@ -67,6 +72,7 @@ class Monitor:
         yield {"program": self._program()}
         ask = request.get("ask")
         if ask == "state":
+            self._measure()
             yield from self._on_loop(self._state)
         elif ask == "activity":
             yield {"activity": self._on_loop(partial(self._snapshot, request.get("since", 0)))}
@@ -94,11 +100,26 @@ class Monitor:
                 f"the program's event loop has not answered within {_LOOP_PATIENCE:.0f} s"
             ) from None
 
+    def _measure(self) -> None:
+        """Have all children measured; wait for the answers, though not for late ones."""
+        answers: queue.SimpleQueue[None] = queue.SimpleQueue()
+        asked = self._on_loop(partial(self._ask_for_usage, lambda: answers.put(None)))
+        deadline = time.monotonic() + _MEASURE_PATIENCE
+        with contextlib.suppress(queue.Empty):
+            for _ in range(asked):
+                answers.get(timeout=max(0.0, deadline - time.monotonic()))
+
+    def _ask_for_usage(self, then: Callable[[], None]) -> int:
+        running = [child for child in self._children if child.handle and child.handle.pid]
+        for child in running:
+            child.measure(then)
+        return len(running)
+
     def _state(self) -> list[dict[str, Any]]:
         pools = [{"pool": pool.describe()._asdict()} for pool in list(self._pools)]
         children = [{"child": facts} for facts in self._describe_children()]
         deaths = [{"death": self._death(record)} for record in self._activity.deaths]
-        return [*pools, *children, *deaths]
+        return [{"totals": self._activity.totals()}, *pools, *children, *deaths]
 
     def _death(self, record: ChildRecord) -> dict[str, Any]:
         ago = self._loop.now() - (record.ended or 0.0)
@@ -156,6 +177,7 @@ def _put(answers: queue.SimpleQueue[tuple[int, str]], number: int, text: str) ->
 
 def _facts(child: Child) -> dict[str, Any]:
     handle = child.handle
+    record = child.owner.record
     assert handle is not None
     return {
         "name": handle.name,
@@ -163,6 +185,8 @@ def _facts(child: Child) -> dict[str, Any]:
         "node": handle.node,
         "pid": handle.pid,
         "state": child.owner.state,
+        "memory": record and record.memory,
+        "cpu": record and record.cpu,
     }
 
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import heapq
+import reprlib
 from collections import Counter
 from collections.abc import Iterable
 from typing import Any, NamedTuple, Protocol
 
 from fiber._engine.ledger import Ledger
+from fiber._wire import work
 
 SLOWEST = 10
 """Running tasks that a state names."""
@@ -22,6 +24,8 @@ class RunningTask(NamedTuple):
     host: str
     seconds: float
     """Time since the worker began the task, or the batch that the task is in."""
+    argument: str
+    """Short form of the argument of a map's task, if it is a plain value; else empty."""
 
 
 class PoolState(NamedTuple):
@@ -77,8 +81,12 @@ def _slowest(handles: Iterable[Any], now: float) -> list[RunningTask]:
 def _running_task(handle: Any, now: float) -> RunningTask:
     """Return the task that a busy worker runs: the first one of its batch without a result."""
     batch = handle.worker.queue[0]
-    name = "a cancelled task"
+    name, argument = "a cancelled task", ""
     if batch.job is not None and batch.job.owner is not None:
         at = min(batch.received, len(batch.items) - 1)
-        name = batch.job.owner.task_name(batch.start + at, batch.items[at])
-    return RunningTask(name, handle.name, handle.host, max(0.0, now - handle.worker.since))
+        item = batch.items[at]
+        name = batch.job.owner.task_name(batch.start + at, item)
+        # Only for these types does repr run none of the user's code.
+        argument = reprlib.repr(item) if work.is_plain([item]) else ""
+    seconds = max(0.0, now - handle.worker.since)
+    return RunningTask(name, handle.name, handle.host, seconds, argument)

@@ -15,10 +15,10 @@ from collections.abc import Callable, Hashable, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 from fiber._wire.memory_files import BytesLike
-from fiber._wire.packet_layout import pieces_of, read_packet
+from fiber._wire.packet_layout import pieces_of, read_packet, redacted
 from fiber.errors import FiberError
 
-PROTOCOL = 4
+PROTOCOL = 5
 """Version of the frames of this module and of all that they carry: the messages of ``work.py`` and
 ``hub.protocol``, and pickles of Fiber's classes.  Raise it when one of these changes."""
 
@@ -47,7 +47,7 @@ class Start(NamedTuple):
         return pieces_of(head, self.spec, [self.process])
 
     def __repr__(self) -> str:
-        return _redacted(self)
+        return redacted(self)
 
 
 class KeepBlob(NamedTuple):
@@ -65,7 +65,7 @@ class KeepBlob(NamedTuple):
         return _BLOB_HEAD.pack(PROTOCOL, _BLOB, self.digest), self.data
 
     def __repr__(self) -> str:
-        return _redacted(self)
+        return redacted(self)
 
 
 class Forget(NamedTuple):
@@ -128,7 +128,7 @@ class Deliver(NamedTuple):
         return pieces_of(head, self.payload, self.buffers)
 
     def __repr__(self) -> str:
-        return _redacted(self)
+        return redacted(self)
 
 
 class FromChild(NamedTuple):
@@ -149,7 +149,7 @@ class FromChild(NamedTuple):
         )
 
     def __repr__(self) -> str:
-        return _redacted(self)
+        return redacted(self)
 
 
 class Recall(NamedTuple):
@@ -197,7 +197,7 @@ class Exited(NamedTuple):
         return _NUMBER.pack(PROTOCOL, _EXITED, self.child) + _json(self[1:])
 
     def __repr__(self) -> str:
-        return _redacted(self)
+        return redacted(self)
 
 
 class ShownStack(NamedTuple):
@@ -211,7 +211,29 @@ class ShownStack(NamedTuple):
         return _NUMBER.pack(PROTOCOL, _STACK, self.child) + _utf8(self.text)
 
     def __repr__(self) -> str:
-        return _redacted(self)
+        return redacted(self)
+
+
+class Measure(NamedTuple):
+    """Master to agent: measure the child's memory and processor time."""
+
+    child: int
+
+    def encode(self) -> bytes:
+        """Return the frame."""
+        return _NUMBER.pack(PROTOCOL, _MEASURE, self.child)
+
+
+class Measured(NamedTuple):
+    """Agent to master: bytes of memory and milliseconds of processor time of a child."""
+
+    child: int
+    memory: int
+    milliseconds: int
+
+    def encode(self) -> bytes:
+        """Return the frame."""
+        return _USAGE.pack(PROTOCOL, _MEASURED, *self)
 
 
 class ChildOutput(NamedTuple):
@@ -225,7 +247,7 @@ class ChildOutput(NamedTuple):
         return _NUMBER.pack(PROTOCOL, _OUTPUT, self.child) + _utf8(self.text)
 
     def __repr__(self) -> str:
-        return _redacted(self)
+        return redacted(self)
 
 
 class TunnelOpen(NamedTuple):
@@ -256,7 +278,7 @@ class TunnelData(NamedTuple):
         return pieces_of(head, self.payload, self.buffers)
 
     def __repr__(self) -> str:
-        return _redacted(self)
+        return redacted(self)
 
 
 class TunnelClose(NamedTuple):
@@ -281,7 +303,7 @@ class MemoryMessage(NamedTuple):
         return _NUMBER.pack(PROTOCOL, _MEMORY, self.block) + self.payload
 
     def __repr__(self) -> str:
-        return _redacted(self)
+        return redacted(self)
 
 
 class Shutdown(NamedTuple):
@@ -321,6 +343,8 @@ LinkMessage: TypeAlias = (
     | Recalled
     | Exited
     | ShownStack
+    | Measure
+    | Measured
     | ChildOutput
     | TunnelOpen
     | TunnelData
@@ -333,6 +357,9 @@ LinkMessage: TypeAlias = (
 
 HubMessage: TypeAlias = TunnelOpen | TunnelData | TunnelClose | MemoryMessage
 """Message between the hubs of both sides."""
+
+ChildRequest: TypeAlias = Deliver | Signal | Recall | Measure
+"""Message that asks something of a child."""
 
 
 def decode(frame: BytesLike) -> LinkMessage:
@@ -362,12 +389,13 @@ def decode(frame: BytesLike) -> LinkMessage:
 
 _START, _STARTED, _SIGNAL, _DELIVER, _FROM_CHILD, _RECALL, _RECALLED, _EXITED = range(1, 9)
 _OUTPUT, _TUNNEL_OPEN, _TUNNEL_DATA, _TUNNEL_CLOSE, _SHUTDOWN = 9, 11, 12, 13, 14
-_BLOB, _FORGET, _LACKING, _MEMORY, _LEAVE, _STACK = range(15, 21)
+_BLOB, _FORGET, _LACKING, _MEMORY, _LEAVE, _STACK, _MEASURE, _MEASURED = range(15, 23)
 
 _HEAD = struct.Struct("<BB")
 _NUMBER = struct.Struct("<BBQ")
 _NUMBERS = struct.Struct("<BBQq")
 _DELIVERY = struct.Struct("<BBQQ")
+_USAGE = struct.Struct("<BBQQQ")
 _GRACE = struct.Struct("<BBd")
 _BLOB_HEAD = struct.Struct(f"<BB{DIGEST_BYTES}s")
 
@@ -489,6 +517,14 @@ def _read_stack(view: memoryview) -> ShownStack:
     return ShownStack(child, _text(view[_NUMBER.size :]))
 
 
+def _read_measure(view: memoryview) -> Measure:
+    return Measure(_NUMBER.unpack(view)[2])
+
+
+def _read_measured(view: memoryview) -> Measured:
+    return Measured(*_USAGE.unpack(view)[2:])
+
+
 def _read_output(view: memoryview) -> ChildOutput:
     return ChildOutput(_NUMBER.unpack_from(view)[2], _text(view[_NUMBER.size :]))
 
@@ -542,6 +578,8 @@ _READERS: dict[int, Callable[[memoryview], LinkMessage]] = {
     _RECALLED: _read_recalled,
     _EXITED: _read_exited,
     _STACK: _read_stack,
+    _MEASURE: _read_measure,
+    _MEASURED: _read_measured,
     _OUTPUT: _read_output,
     _TUNNEL_OPEN: _read_tunnel_open,
     _TUNNEL_DATA: _read_tunnel_data,
@@ -550,20 +588,3 @@ _READERS: dict[int, Callable[[memoryview], LinkMessage]] = {
     _SHUTDOWN: _read_shutdown,
     _LEAVE: _read_leave,
 }
-
-
-def _redacted(message: tuple[Any, ...]) -> str:
-    """Return the repr of a message with the user's data: sizes instead of values."""
-    values = zip(message._fields, message, strict=True)  # type: ignore[attr-defined]  # a NamedTuple
-    inner = ", ".join(f"{name}={_shown(value)}" for name, value in values)
-    return f"{type(message).__name__}({inner})"
-
-
-def _shown(value: Any) -> str:
-    if isinstance(value, bytes | bytearray | memoryview):
-        return f"<{memoryview(value).nbytes} bytes>"
-    if isinstance(value, str):
-        return f"<{len(value)} characters>"
-    if isinstance(value, list | tuple) and not all(isinstance(item, int) for item in value):
-        return f"<{len(value)} items>"
-    return repr(value)

@@ -1,4 +1,4 @@
-"""Layout of a packet in a frame between master and agent.
+"""Layout of a packet in a frame between master and agent, and the repr of such frames.
 
 Little endian: count:u32, payload length:u64, buffer length:u64 * count, the payload, and each
 buffer at the next multiple of ALIGNMENT.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
+from typing import Any
 
 from fiber._wire.memory_files import BytesLike
 from fiber._wire.packet import ALIGNMENT, INLINE_LIMIT
@@ -54,3 +55,20 @@ def read_packet(view: memoryview, at: int) -> tuple[memoryview, list[memoryview]
 
 def _aligned(offset: int) -> int:
     return -(-offset // ALIGNMENT) * ALIGNMENT
+
+
+def redacted(message: tuple[Any, ...]) -> str:
+    """Return the repr of a message with the user's data: sizes instead of values."""
+    values = zip(message._fields, message, strict=True)  # type: ignore[attr-defined]  # a NamedTuple
+    inner = ", ".join(f"{name}={_shown(value)}" for name, value in values)
+    return f"{type(message).__name__}({inner})"
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, bytes | bytearray | memoryview):
+        return f"<{memoryview(value).nbytes} bytes>"
+    if isinstance(value, str):
+        return f"<{len(value)} characters>"
+    if isinstance(value, list | tuple) and not all(isinstance(item, int) for item in value):
+        return f"<{len(value)} items>"
+    return repr(value)
