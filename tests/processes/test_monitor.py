@@ -147,7 +147,7 @@ def test_an_unknown_question_is_an_error(pool: Pool) -> None:
 
 
 def state() -> dict[str, list[dict[str, Any]]]:
-    found: dict[str, list[dict[str, Any]]] = {"pool": [], "child": [], "death": []}
+    found: dict[str, list[dict[str, Any]]] = {"totals": [], "pool": [], "child": [], "death": []}
     for line in ask(ask="state"):
         for kind, facts in line.items():
             found[kind].append(facts)

@@ -10,7 +10,7 @@ _TICKS = os.sysconf("SC_CLK_TCK")
 
 
 class Usage(NamedTuple):
-    """What a process uses."""
+    """Memory and processor time of a process."""
 
     memory: int
     """Resident memory in bytes.  Pages that processes share count for each of them."""
@@ -19,7 +19,7 @@ class Usage(NamedTuple):
 
 
 def usage_of(pid: int) -> Usage | None:
-    """Return what a process uses; None if it has ended."""
+    """Return the usage of a process; None if it has ended."""
     try:
         with open(f"/proc/{pid}/stat", "rb") as file:
             fields = file.read().rpartition(b")")[2].split()
