@@ -22,7 +22,7 @@ unexport PYTHONDONTWRITEBYTECODE
 CLUSTER := PYTHONPATH=tests $(BIN)/python -m cluster
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-fast test-pythons test-long e2e lint bench bench-operator bench-kubernetes conformance conformance-original crds docs images cluster cluster-down release release-prepare release-dry-run clean
+.PHONY: help demo test test-fast test-pythons test-long e2e lint bench bench-operator bench-kubernetes conformance conformance-original crds docs pictures images cluster cluster-down release release-prepare release-dry-run clean
 
 help:
 	@sed -n 's/^## //p' $(MAKEFILE_LIST)
@@ -127,6 +127,10 @@ crds: $(VENV)/.with-dev
 ## make docs          the documentation as a site, into build/site; warnings and broken links are errors
 docs: $(VENV)/.with-docs
 	$(BIN)/python -m docsite
+
+## make pictures      the pictures of terminals in the documentation
+pictures: $(VENV)/.with-dev
+	$(BIN)/python -m docsite.terminal_pictures
 
 ## make images        the operator's image and the workers', by docker or buildah, into build/images
 images: $(VENV)/.made

@@ -66,7 +66,7 @@ def test_memory_and_processors_of_a_host_are_added_up() -> None:
 def test_losses_are_shown_when_there_are_some() -> None:
     totals = {"failed": 2, "retried": 0, "lost": 1, "bytes_sent": 2048, "bytes_received": 10}
     text = frame(sample(totals=[totals, totals]), None)
-    assert "failed: 4   lost: 2   sent: 4.0 KiB   received: 20 B" in text
+    assert "\nfailed: 4   lost: 2   sent: 4.0 KiB   received: 20 B" in text
     assert "retried" not in text
 
 

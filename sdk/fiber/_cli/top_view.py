@@ -68,9 +68,9 @@ def _counts(sample: Sample, before: Sample | None) -> str:
         ("waiting", str(sum(pool["waiting"] for pool in sample.pools))),
     ]
     counted = [(name, int(sample.total(name))) for name in ("failed", "retried", "lost")]
-    facts += [(name, str(count)) for name, count in counted if count]
-    facts += [(word, display.size(sample.total(f"bytes_{word}"))) for word in ("sent", "received")]
-    return "   ".join(f"{name}: {value}" for name, value in facts)
+    more = [(name, str(count)) for name, count in counted if count]
+    more += [(word, display.size(sample.total(f"bytes_{word}"))) for word in ("sent", "received")]
+    return "\n".join("   ".join(map(": ".join, line)) for line in (facts, more))
 
 
 def _rate(sample: Sample, before: Sample | None) -> str:
