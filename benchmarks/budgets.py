@@ -134,6 +134,19 @@ def _pool() -> Iterator[Budget]:
     yield Budget(what, "throughput", case, throughput.TIME.name, 1.03, unit="s")
 
 
+def _watched() -> Iterator[Budget]:
+    """Return the budgets of a program whose progress, page, timeline and logs are all on."""
+    ours: Any = {"contender": "fiber-watched", "against": "fiber"}
+    case = "map, chunksize 1"
+    what = "everything shown, to nothing shown: no-op tasks, chunksize 1"
+    yield Budget(what, "throughput", case, throughput.RATE.name, 0.98, at_least=True, **ours)
+    what = "everything shown, to nothing shown: latency of one apply, p50"
+    yield Budget(what, "latency", latency.NAME, latency.P50.name, 1.02, **ours)
+    case = overhead.case_name(0.001, "chunksize 1")
+    what = f"everything shown, to nothing shown: overhead: {case}"
+    yield Budget(what, "overhead", case, overhead.TIME.name, 1.02, **ours)
+
+
 def _executors() -> Iterator[Budget]:
     """Return the budgets of executors: issue 11 asks for five times concurrent.futures; loky and
     loops were added."""
@@ -370,6 +383,7 @@ def _relayed() -> Iterator[Budget]:
 
 BUDGETS = (
     *_pool(),
+    *_watched(),
     *_executors(),
     *_pipes(),
     *_sharing(),

@@ -88,6 +88,23 @@ ALL = (
         environment={"FIBER_BACKEND": "loopback"},
     ),
     Contender(
+        "fiber-watched",
+        "Fiber, everything shown",
+        ("fiber",),
+        _POOL,
+        "#0072B2",
+        "p",
+        environment={
+            "FIBER_BACKEND": "local",
+            "FIBER_DASHBOARD": "1",
+            "FIBER_LOG_RECORDS": "INFO",
+            "FIBER_LOG_TO": "logs",
+            "FIBER_METRICS_PORT": "0",
+            "FIBER_PROGRESS": "always",
+            "FIBER_TIMELINE": "timeline.json",
+        },
+    ),
+    Contender(
         "fiber-executor",
         "fiber.Executor",
         ("fiber",),
