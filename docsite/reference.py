@@ -12,7 +12,7 @@ import click
 import griffe
 
 import fiber
-from docsite import ROOT, SiteError
+from docsite import ROOT, SiteError, staging
 from fiber import config, errors
 from fiber._cli.main import _group
 from fiber_api import names
@@ -20,6 +20,9 @@ from fiber_api.schema import schema
 
 MODULES = sorted({*fiber._SUBMODULES, "joblib"} - {"errors"})
 """Modules with a page of their names. Errors have a page with more."""
+
+_UNSEARCHED = ("fiber.config",)
+"""Pages that the search leaves out. The page of the configuration describes the same keys."""
 
 _HEAD = "<!-- Written by python -m docsite. -->\n\n"
 
@@ -37,7 +40,8 @@ def write(folder: Path) -> None:
         **{f"fiber.{name}": module_page(package, name) for name in MODULES},
     }
     for name, text in pages.items():
-        (folder / f"{name}.md").write_text(_HEAD + text, encoding="utf-8")
+        head = staging.EXCLUDED + _HEAD if name in _UNSEARCHED else _HEAD
+        (folder / f"{name}.md").write_text(head + text, encoding="utf-8")
 
 
 # ---- modules --------------------------------------------------------------------------------

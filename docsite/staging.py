@@ -29,7 +29,8 @@ _UNSEARCHED = ("benchmarks", "decisions")
 Almost every word of a question is somewhere in them, so they would come before the guides.
 """
 
-_EXCLUDED = "---\nsearch:\n  exclude: true\n---\n\n"
+EXCLUDED = "---\nsearch:\n  exclude: true\n---\n\n"
+"""Head of a page that the search leaves out."""
 
 _FENCE = re.compile(r"(^```.*?^```$)", re.MULTILINE | re.DOTALL)
 
@@ -43,7 +44,7 @@ def stage(target: Path, root: Path = ROOT) -> None:
     for page in target.rglob("*.md"):
         name = page.relative_to(target)
         text = with_absolute_links(root / "docs" / name, host, root)
-        head = _EXCLUDED if name.parts[0] in _UNSEARCHED else ""
+        head = EXCLUDED if name.parts[0] in _UNSEARCHED else ""
         page.write_text(head + text, encoding="utf-8")
 
 

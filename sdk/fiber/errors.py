@@ -276,7 +276,8 @@ class StartError(FiberError):
 class TooManyOpenFiles(FiberError, OSError):
     """No file descriptor is left (errno EMFILE); says the limit and how to raise it.
 
-    When: the program holds more processes, pipes, queues and files than `ulimit -n` allows.
+    When: too many open files: processes, pipes, queues and files need more descriptors than
+    `ulimit -n` allows.
 
     What to do: raise that limit, use fewer processes, or close what is not needed.
     """
@@ -301,8 +302,8 @@ class UnpicklableError(FiberError, pickle.PicklingError, TypeError):
     `what` is its role ("argument 2 of task f"), `path` the path from there to the culprit
     ("['options'].lock", empty when unknown), `reason` the pickler's text.
 
-    When: an argument of a task or process, or an item of a queue, holds a lock of `threading`, an
-    open file, a socket, a generator.
+    When: an argument of a task or process, or an item of a queue, cannot be pickled: it holds a
+    lock of `threading`, an open file, a socket, a generator.
 
     What to do: send the data that the object is made from, and build it in the other process. Or
     give its class a `__reduce__` method.
@@ -325,7 +326,8 @@ class VersionMismatch(FiberError):
 
     `what` says which one: "Fiber protocol" or "Python", for instance.
 
-    When: an image of workers has another fiberpool or Python than the program.
+    When: a version mismatch: the image of workers has another fiberpool or Python than the
+    program.
 
     What to do: rebuild the image with the program's versions: `fiber image build`.
     """

@@ -87,10 +87,15 @@ def test_the_search_index_is_a_file_of_the_site(site: Path) -> None:
 
 
 QUESTIONS = {
+    ("How do I install it?", "macos"): ("how-do-i-install-it",),
+    ("Is it faster than Ray?",): ("is-it-faster-than-multiprocessing-ray-or-dask",),
+    ("Why do I get no workers?",): ("why-do-i-get-no-workers", "doctor"),
+    ("What if memory runs out?", "out of memory", "killed"): ("what-if-memory-runs-out",),
+    ("How do I set a timeout?",): ("how-do-i-set-a-timeout",),
     ("How many workers?", "number of workers", "pool size"): ("how-many-workers", "sizing"),
     ("Why is it slow?", "slow", "speed up"): ("why-is-it-slow",),
     ("Where is my print?", "print", "output of workers", "stdout"): ("where-is-my-print",),
-    ("What died?", "worker died", "killed"): ("what-died",),
+    ("What died?", "worker died"): ("what-died",),
     ("crash",): ("what-died", "checkpoints"),
     ("How do I use my own image?", "my image", "docker image"): (
         "how-do-i-use-my-own-image",
@@ -115,6 +120,23 @@ def test_a_newcomer_finds_an_answer_among_the_first_three_results(site: Path) ->
         if not any(answers_it(result.location, answers) for result in results[:3])
     ]
     assert not missed, "\n".join(missed)
+
+
+ERRORS = {
+    "too many open files": "TooManyOpenFiles",
+    "cannot be pickled": "UnpicklableError",
+    "died while it ran": "WorkerDied",
+    "version mismatch": "VersionMismatch",
+}
+"""Words of messages, and the errors that have them."""
+
+
+@pytest.mark.slow
+def test_the_words_of_a_message_lead_to_the_error(site: Path) -> None:
+    found = search(site, list(ERRORS))
+    for (words, name), results in zip(ERRORS.items(), found, strict=True):
+        page = f"reference/errors.html#fiber.errors.{name}"
+        assert page in [result.location for result in results[:5]], words
 
 
 def answers_it(location: str, answers: tuple[str, ...]) -> bool:
