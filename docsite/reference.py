@@ -218,7 +218,7 @@ _MULTIPROCESSINGS = {
     "cannot be rebuilt in the program.\n\nWhat to do: return plain data, or give the class a "
     "`__reduce__` method. The error shows the value as text.",
 }
-"""What the errors mean that are multiprocessing's own classes."""
+"""Meanings of the errors that are multiprocessing's own classes."""
 
 
 def _pool_reasons() -> Iterator[str]:
