@@ -124,8 +124,10 @@ conformance-original: $(VENV)/.with-dev
 crds: $(VENV)/.with-dev
 	$(BIN)/python -m fiber_api.schema
 
-## make docs          the documentation as a site, into build/site; warnings and broken links are errors
+## make docs          the documentation as a site, into build/site, and the tutorial as a notebook; warnings and
+##                    broken links are errors
 docs: $(VENV)/.with-docs
+	$(BIN)/python -m docsite.notebook
 	$(BIN)/python -m docsite
 
 ## make pictures      the pictures of terminals in the documentation

@@ -12,7 +12,7 @@ import click
 import griffe
 
 import fiber
-from docsite import ROOT, SiteError
+from docsite import ROOT, SiteError, staging
 from fiber import config, errors
 from fiber._cli.main import _group
 from fiber_api import names
@@ -20,6 +20,9 @@ from fiber_api.schema import schema
 
 MODULES = sorted({*fiber._SUBMODULES, "joblib"} - {"errors"})
 """Modules with a page of their names. Errors have a page with more."""
+
+_UNSEARCHED = ("fiber.config",)
+"""Pages that the search leaves out. The page of the configuration describes the same keys."""
 
 _HEAD = "<!-- Written by python -m docsite. -->\n\n"
 
@@ -37,7 +40,8 @@ def write(folder: Path) -> None:
         **{f"fiber.{name}": module_page(package, name) for name in MODULES},
     }
     for name, text in pages.items():
-        (folder / f"{name}.md").write_text(_HEAD + text, encoding="utf-8")
+        head = staging.EXCLUDED + _HEAD if name in _UNSEARCHED else _HEAD
+        (folder / f"{name}.md").write_text(head + text, encoding="utf-8")
 
 
 # ---- modules --------------------------------------------------------------------------------
@@ -178,14 +182,54 @@ def errors_page(package: griffe.Module) -> str:
     classes = [f"::: {one.path}" for one in shown if one.name != "MaybeEncodingError"]
     return "\n\n".join(
         [
-            "# Errors",
+            "# Errors, one by one",
+            "The message of an error says what happened, why, and what to do. `except` clauses of "
+            "multiprocessing's programs catch Fiber's errors, too.",
             _docstring(found),
             *classes,
+            "## Errors of multiprocessing",
+            "Fiber raises them where multiprocessing does.",
+            *(f"### {name}\n\n{text}" for name, text in _MULTIPROCESSINGS.items()),
             "## Reasons of a WorkerDied",
             "`WorkerDied.reason` begins with one of these words if Fiber or Kubernetes knows why.",
             "| reason | what to do |\n|---|---|\n" + "\n".join(advice) + "\n",
+            "## Reasons of a FiberPoolError",
+            "`FiberPoolError.reason` is one of these, a word of Kubernetes (`Unschedulable`), "
+            "or `NoOperator`, `InUse`, `Unreachable`. [Failures](../failures.md) and "
+            "[FiberPools](../fiberpools.md#when-it-does-not-work) say more.",
+            "| reason | what it means |\n|---|---|\n" + "\n".join(_pool_reasons()) + "\n",
         ]
     )
+
+
+_MULTIPROCESSINGS = {
+    "ProcessError": "When: never itself. It is the base of the three below, and of Fiber's errors.",
+    "TimeoutError": "When: `get(timeout=)` and other waits end without a result, and a task runs "
+    "for longer than `timeout=` or `task_timeout=`. It is multiprocessing's class, and not the "
+    "builtin one: write `except fiber.TimeoutError`.\n\nWhat to do: the worker of a task over its "
+    "time limit has been replaced. The error shows where the task was. After a wait, the task "
+    "still runs: wait again.",
+    "BufferTooShort": "When: `recv_bytes_into()` gets more than fits.\n\nWhat to do: the message "
+    "is `error.args[0]`. Give a larger buffer.",
+    "AuthenticationError": "When: the two sides of a link have different keys, or the `authkey` of "
+    "a `Listener`, `Client` or manager's address is wrong.\n\nWhat to do: give both sides the same "
+    "key. On a cluster, start the program again.",
+    "MaybeEncodingError": "When: the result or the exception of a task cannot be pickled, or "
+    "cannot be rebuilt in the program.\n\nWhat to do: return plain data, or give the class a "
+    "`__reduce__` method. The error shows the value as text.",
+}
+"""Meanings of the errors that are multiprocessing's own classes."""
+
+
+def _pool_reasons() -> Iterator[str]:
+    """Yield a row for each problem of a FiberPool that is no word of Kubernetes' own."""
+    described = griffe.load("fiber_api", search_paths=[ROOT / "crds"])["names.Reason"].members
+    for reason in names.Reason:
+        if reason is names.Reason.AS_EXPECTED:  # reasons of conditions and events follow
+            return
+        if docstring := described[reason.name].docstring:
+            text = " ".join(docstring.value.split()).replace("``", "`")
+            yield f"| `{reason}` | {text} |"
 
 
 # ---- configuration --------------------------------------------------------------------------

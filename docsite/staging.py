@@ -1,7 +1,8 @@
-"""Copies of the pages of ``docs``, whose links outside that folder lead to the code host.
+"""Copies of the pages of ``docs``, with other links, and without benchmarks in the search.
 
 A page of ``docs`` is also read on the code host, so its links are relative paths of the repository.
-The site has the folder ``docs`` only.
+The site has the folder ``docs`` and the reference. Links to other files lead to the code host, and
+links to sources that have a page of the reference lead there.
 """
 
 from __future__ import annotations
@@ -15,6 +16,22 @@ from pathlib import Path
 from docsite import ROOT, SiteError
 
 _LINK = re.compile(r"(!?\[[^]]*\]\()([^)\s#:]+)(#[^)\s]*)?(?=[)\s])")
+_REFERENCE = {
+    "sdk/fiber": "reference/fiber.md",
+    "sdk/fiber/config.py": "reference/configuration.md",
+    "sdk/fiber/errors.py": "reference/errors.md",
+}
+"""Sources that have a page of the reference."""
+
+_UNSEARCHED = ("benchmarks", "decisions")
+"""Folders whose pages the search leaves out: tables of numbers, and reasons of developers.
+
+Almost every word of a question is somewhere in them, so they would come before the guides.
+"""
+
+EXCLUDED = "---\nsearch:\n  exclude: true\n---\n\n"
+"""Head of a page that the search leaves out."""
+
 _FENCE = re.compile(r"(^```.*?^```$)", re.MULTILINE | re.DOTALL)
 
 
@@ -25,8 +42,10 @@ def stage(target: Path, root: Path = ROOT) -> None:
     shutil.copytree(root / "docsite" / "assets", target / "assets")
     host = source_address(root)
     for page in target.rglob("*.md"):
-        original = root / "docs" / page.relative_to(target)
-        page.write_text(with_absolute_links(original, host, root), encoding="utf-8")
+        name = page.relative_to(target)
+        text = with_absolute_links(root / "docs" / name, host, root)
+        head = EXCLUDED if name.parts[0] in _UNSEARCHED else ""
+        page.write_text(head + text, encoding="utf-8")
 
 
 def source_address(root: Path = ROOT) -> str:
@@ -36,16 +55,23 @@ def source_address(root: Path = ROOT) -> str:
     return f"{source}/blob/main"
 
 
-def with_absolute_links(page: Path, host: str, root: Path = ROOT) -> str:
-    """Return the text of a page in which links to files outside of ``docs`` are addresses."""
+def with_absolute_links(page: Path, host: str, root: Path = ROOT, *, site: bool = True) -> str:
+    """Return the text of a page in which links are addresses, except those to the site's pages.
+
+    ``site=False`` is for a text that is read without the site: all its links are addresses.
+    """
 
     def replaced(link: re.Match[str]) -> str:
         path = Path(os.path.normpath(page.parent / link[2]))
-        if path.is_relative_to(root / "docs"):
+        if site and path.is_relative_to(root / "docs"):
             return link[0]
         if not path.exists():
             raise SiteError(f"{page.relative_to(root)}: {link[2]} does not exist. Mend the link.")
-        return f"{link[1]}{host}/{path.relative_to(root)}{link[3] or ''}"
+        name = str(path.relative_to(root))
+        if site and name in _REFERENCE:
+            target = os.path.relpath(root / "docs" / _REFERENCE[name], page.parent)
+            return f"{link[1]}{target}{link[3] or ''}"
+        return f"{link[1]}{host}/{name}{link[3] or ''}"
 
     parts = _FENCE.split(page.read_text(encoding="utf-8"))
     parts[::2] = [_LINK.sub(replaced, part) for part in parts[::2]]

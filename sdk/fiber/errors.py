@@ -76,7 +76,12 @@ if not TYPE_CHECKING:  # a type checker would accept any name
 
 
 class FiberError(ProcessError):
-    """Base of Fiber's errors."""
+    """Base of Fiber's errors.
+
+    When: never itself. `except fiber.FiberError` catches all of them.
+
+    What to do: read the message, which ends with that.
+    """
 
     def __reduce__(self) -> tuple[Any, ...]:
         # BaseException would call type(self)(*args). That fails for an __init__ that takes more
@@ -92,15 +97,33 @@ def _rebuild(kind: type[FiberError], args: tuple[Any, ...]) -> FiberError:
 
 
 class ConfigError(FiberError, ValueError):
-    """A key that does not exist or a value that does not fit; names the key and its source."""
+    """A key that does not exist or a value that does not fit; names the key and its source.
+
+    When: `fiber.init()`, or the first process, pool, pipe or queue, reads the configuration.
+
+    What to do: correct the key in the source that the message names.
+    """
 
 
 class AdoptionError(FiberError):
-    """`fiber.adopt()` cannot rebind a module, and has left it unchanged; says why."""
+    """`fiber.adopt()` cannot rebind a module, and has left it unchanged; says why.
+
+    When: the import of the module fails, it has no name of multiprocessing, or it keeps objects
+    that cannot be rebound.
+
+    What to do: name the module that imports multiprocessing. Replace the objects that the message
+    names before the call, or leave the module on multiprocessing.
+    """
 
 
 class AgentLost(FiberError):
-    """The agent of a host does not answer; the processes that it runs are lost."""
+    """The agent of a host does not answer; the processes that it runs are lost.
+
+    When: its pod or host is gone, or the network to it is cut for longer than `lost_after`.
+
+    What to do: look at the agent's last output, and whether the host can be reached. Tasks of
+    pools run elsewhere by themselves.
+    """
 
     def __init__(self, agent: str, host: str, reason: str) -> None:
         super().__init__(
@@ -117,6 +140,11 @@ class ConnectionClosed(EOFError, FiberError):
 
     It is an EOFError, as in multiprocessing. In addition `peer` names the holder of the other
     end, and `reason` says how its process ended, where Fiber knows.
+
+    When: `recv()`, `send()`, or a call of a manager's proxy, after the other process has ended.
+
+    What to do: if the other side ended as planned, catch it as the end of the messages. Otherwise
+    look for the cause in `reason`, and start that process again.
     """
 
     def __init__(self, peer: str | None = None, reason: str | None = None) -> None:
@@ -135,6 +163,11 @@ class FiberPoolError(FiberError):
 
     `reason` is one word: the problem in the pool's status (`ImagePullError`), or Kubernetes'
     reason for a call that it refuses (`Forbidden`).
+
+    When: on Kubernetes, at the first process or pool, or in a waiting call.
+
+    What to do: follow the message. `fiber doctor` looks at each step up to a worker, and
+    `kubectl describe fiberpool NAME` shows the pool's problems and events.
     """
 
     def __init__(self, message: str, *, pool: str, namespace: str, reason: str) -> None:
@@ -145,7 +178,12 @@ class FiberPoolError(FiberError):
 
 
 class FileTooLarge(FiberError, OSError):
-    """Shared memory would exceed the limit of file sizes (errno EFBIG); says the limit."""
+    """Shared memory would exceed the limit of file sizes (errno EFBIG); says the limit.
+
+    When: a large message, or an array, in a process with `ulimit -f`.
+
+    What to do: raise that limit, or send less at a time.
+    """
 
     def __init__(self, doing: str) -> None:
         soft, _ = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -161,11 +199,22 @@ class FileTooLarge(FiberError, OSError):
 
 
 class LinkError(FiberError):
-    """A link between a master and an agent cannot be made, or the other side refused it."""
+    """A link between a master and an agent cannot be made, or the other side refused it.
+
+    When: `listen_port` is in use, `listen_host` is no address of this machine, or something else
+    than Fiber answers at the other end.
+
+    What to do: choose another port or address, or leave out the key: Fiber finds both.
+    """
 
 
 class MemberLost(FiberError):
-    """A member of a ring has ended; `rank` is its number, `how` says how it ended."""
+    """A member of a ring has ended; `rank` is its number, `how` says how it ended.
+
+    When: the other members send to it, receive from it, or wait for it.
+
+    What to do: remove the cause that `how` names, and run the ring again from saved state.
+    """
 
     def __init__(self, rank: int, how: str) -> None:
         super().__init__(
@@ -180,6 +229,11 @@ class ProgramTooLarge(FiberError):
     """The program's files are too large to be sent to other hosts.
 
     `folder` is the program's, `largest` are its largest parts: paths and sizes, as text.
+
+    When: the first process on another host.
+
+    What to do: name files that workers do not need in `.fiberignore`. Data that they need belongs
+    into their image or on a volume.
     """
 
     def __init__(self, folder: str, size: str, limit: str, largest: Mapping[str, str]) -> None:
@@ -200,6 +254,11 @@ class StartError(FiberError):
 
     `cause` is the output or traceback of that process, as text: this process may be unable to
     import the class of the exception.
+
+    When: `Process.start()`, or a call of a pool whose workers cannot start: an initializer raises,
+    a module is missing, memory or processes run out.
+
+    What to do: correct what `cause` shows. In a pod, a missing module belongs into the image.
     """
 
     def __init__(self, who: str, reason: str, cause: str = "", attempts: int = 1) -> None:
@@ -215,7 +274,13 @@ class StartError(FiberError):
 
 
 class TooManyOpenFiles(FiberError, OSError):
-    """No file descriptor is left (errno EMFILE); says the limit and how to raise it."""
+    """No file descriptor is left (errno EMFILE); says the limit and how to raise it.
+
+    When: too many open files: processes, pipes, queues and files need more descriptors than
+    `ulimit -n` allows.
+
+    What to do: raise that limit, use fewer processes, or close what is not needed.
+    """
 
     def __init__(self, doing: str) -> None:
         soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -236,6 +301,12 @@ class UnpicklableError(FiberError, pickle.PicklingError, TypeError):
 
     `what` is its role ("argument 2 of task f"), `path` the path from there to the culprit
     ("['options'].lock", empty when unknown), `reason` the pickler's text.
+
+    When: an argument of a task or process, or an item of a queue, cannot be pickled: it holds a
+    lock of `threading`, an open file, a socket, a generator.
+
+    What to do: send the data that the object is made from, and build it in the other process. Or
+    give its class a `__reduce__` method.
     """
 
     def __init__(self, what: str, reason: str, path: str = "") -> None:
@@ -254,6 +325,11 @@ class VersionMismatch(FiberError):
     """The two sides of a link differ in a version that must be equal.
 
     `what` says which one: "Fiber protocol" or "Python", for instance.
+
+    When: a version mismatch: the image of workers has another fiberpool or Python than the
+    program.
+
+    What to do: rebuild the image with the program's versions: `fiber image build`.
     """
 
     def __init__(self, what: str, *, ours: str, theirs: str, peer: str) -> None:
@@ -278,6 +354,11 @@ class WorkerDied(FiberError):
     ended: by a drain, an eviction, a preemption, a lost node. On Kubernetes `pod` and `node`
     name the worker's pod and its node; elsewhere they are None. If the pod has ended, `reason`
     begins with Kubernetes' word for it ("OOMKilled: ...").
+
+    When: a task's worker died in each of its 1 + `retries` runs, or the cluster ended more than
+    `disruptions` of them.
+
+    What to do: the message ends with it, by the way in which the worker ended.
     """
 
     def __init__(

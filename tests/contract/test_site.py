@@ -11,6 +11,7 @@ import pytest
 from docsite import ROOT, SiteError, building, checking, reference, staging
 
 import fiber
+from contract.site_search import search
 from fiber.config import Config
 from fiber_api.schema import schema
 
@@ -77,9 +78,78 @@ def test_signatures_have_types(site: Path) -> None:
     assert re.search(r"timeout:\s*float\s*\|\s*None\s*=\s*None", signature)
 
 
+# ---- the search -----------------------------------------------------------------------------
+
+
 @pytest.mark.slow
 def test_the_search_index_is_a_file_of_the_site(site: Path) -> None:
     assert "fiber.pool" in (site / "search.js").read_text(encoding="utf-8")
+
+
+QUESTIONS = {
+    ("How do I install it?", "macos"): ("how-do-i-install-it",),
+    ("Is it faster than Ray?",): ("is-it-faster-than-multiprocessing-ray-or-dask",),
+    ("Why do I get no workers?",): ("why-do-i-get-no-workers", "doctor"),
+    ("What if memory runs out?", "out of memory", "killed"): ("what-if-memory-runs-out",),
+    ("How do I set a timeout?",): ("how-do-i-set-a-timeout",),
+    ("How many workers?", "number of workers", "pool size"): ("how-many-workers", "sizing"),
+    ("Why is it slow?", "slow", "speed up"): ("why-is-it-slow",),
+    ("Where is my print?", "print", "output of workers", "stdout"): ("where-is-my-print",),
+    ("What died?", "worker died"): ("what-died",),
+    ("crash",): ("what-died", "checkpoints"),
+    ("How do I use my own image?", "my image", "docker image"): (
+        "how-do-i-use-my-own-image",
+        "images-of-your-own",
+    ),
+    ("How do I stop it?", "stop", "cancel"): ("how-do-i-stop-it-or-cancel-a-task",),
+    ("How do I pass data?", "share data", "large arguments"): ("how-do-i-pass-data",),
+    ("Does it work in a notebook?", "jupyter"): ("does-it-work-in-a-notebook",),
+    ("What does it cost on a laptop?", "laptop", "overhead"): ("what-does-it-cost-on-a-laptop",),
+    ("How do I run on GPUs?", "gpu", "cuda"): ("how-do-i-run-on-gpus", "gpus"),
+}
+"""Questions of newcomers in several words; the answers: places of questions.md, or pages."""
+
+
+@pytest.mark.slow
+def test_a_newcomer_finds_an_answer_among_the_first_three_results(site: Path) -> None:
+    asked = [(query, answers) for words, answers in QUESTIONS.items() for query in words]
+    found = search(site, [query for query, _ in asked])
+    missed = [
+        f"{query!r}: {[result.location for result in results]}"
+        for (query, answers), results in zip(asked, found, strict=True)
+        if not any(answers_it(result.location, answers) for result in results[:3])
+    ]
+    assert not missed, "\n".join(missed)
+
+
+ERRORS = {
+    "too many open files": "TooManyOpenFiles",
+    "cannot be pickled": "UnpicklableError",
+    "died while it ran": "WorkerDied",
+    "version mismatch": "VersionMismatch",
+}
+"""Words of messages, and the errors that have them."""
+
+
+@pytest.mark.slow
+def test_the_words_of_a_message_lead_to_the_error(site: Path) -> None:
+    found = search(site, list(ERRORS))
+    for (words, name), results in zip(ERRORS.items(), found, strict=True):
+        page = f"reference/errors.html#fiber.errors.{name}"
+        assert page in [result.location for result in results[:5]], words
+
+
+def answers_it(location: str, answers: tuple[str, ...]) -> bool:
+    name, _, place = location.partition("#")
+    return (place if name == "questions.html" else name.removesuffix(".html")) in answers
+
+
+@pytest.mark.slow
+def test_the_search_leaves_out_tables_of_numbers(site: Path) -> None:
+    results = [result for found in search(site, ["fiber", "multiprocessing"]) for result in found]
+    assert results
+    index = (site / "search.json").read_text(encoding="utf-8")
+    assert '"benchmarks/overhead.html' not in index
 
 
 @pytest.mark.slow
@@ -119,12 +189,32 @@ def test_each_error_is_described(package: griffe.Module) -> None:
         assert re.search(rf"\b{name}\b", text), name
 
 
+def test_each_error_says_when_it_comes_and_what_to_do(package: griffe.Module) -> None:
+    text = reference.errors_page(package)
+    for name in fiber.errors.__all__:
+        own = package["errors"].members.get(name)
+        if isinstance(own, griffe.Class) and own.docstring:
+            meaning = own.docstring.value
+        else:
+            meaning = text.partition(f"### {name}\n")[2].partition("\n#")[0]
+        assert "When: " in meaning, name
+        assert "What to do: " in meaning or name == "ProcessError", name
+
+
 # ---- links ----------------------------------------------------------------------------------
 
 
 def test_a_link_out_of_the_folder_leads_to_the_code_host(tmp_path: Path) -> None:
     found = staged(tmp_path, "[a](../sdk/a.py#L3) [b](other.md#place) ![c](images/c.png)")
     assert found == "[a](https://host/sdk/a.py#L3) [b](other.md#place) ![c](images/c.png)"
+
+
+def test_a_link_to_a_source_leads_to_its_page_of_the_reference(tmp_path: Path) -> None:
+    folder = tmp_path / "sdk" / "fiber"
+    folder.mkdir(parents=True)
+    (folder / "errors.py").touch()
+    text = staged(tmp_path, "[errors](../sdk/fiber/errors.py)")
+    assert text == "[errors](reference/errors.md)"
 
 
 def test_code_is_not_changed(tmp_path: Path) -> None:
@@ -139,7 +229,7 @@ def test_a_link_to_a_missing_file_is_an_error(tmp_path: Path) -> None:
 
 def staged(root: Path, text: str) -> str:
     for folder in ("docs", "sdk"):
-        (root / folder).mkdir()
+        (root / folder).mkdir(exist_ok=True)
     (root / "sdk" / "a.py").touch()
     (root / "docs" / "page.md").write_text(text, encoding="utf-8")
     return staging.with_absolute_links(root / "docs" / "page.md", "https://host", root)

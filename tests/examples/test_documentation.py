@@ -53,8 +53,14 @@ def test_programs_of_the_documentation_run(program: str, backend: str, tmp_path:
     assert not done.stderr
 
 
-def test_the_readme_shows_a_program() -> None:
-    assert FENCED.search((ROOT / "README.md").read_text(encoding="utf-8"))
+@pytest.mark.parametrize("name", ["README.md", "docs/README.md"])
+def test_the_first_page_fits_a_screen(name: str) -> None:
+    first = (ROOT / name).read_text(encoding="utf-8").partition("\n## ")[0]
+    program = FENCED.search(first)
+    assert program is not None
+    assert len(program[1].strip().splitlines()) <= 10
+    assert len(LINK.findall(first)) == 3
+    assert len(first.splitlines()) <= 32
 
 
 @pytest.mark.parametrize(
