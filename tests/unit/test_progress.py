@@ -69,6 +69,12 @@ def item_of(future: Future) -> WorkItem:
     return WorkItem(work.MAP, future=future)
 
 
+def counting(item: WorkItem, total: int | None, reporter: ProgressReporter) -> ProgressFuture:
+    """Put a future that counts before the future of a map."""
+    item.future = made = ProgressFuture(item, "f", total, lambda: 0, reporter.wake)
+    return made
+
+
 def progress(**facts: Any) -> MapProgress:
     usual = {"name": "f", "done": 0, "total": 10, "failed": 0, "lost": 0, "busy": 0, "seconds": 0.0}
     return MapProgress(**{**usual, **facts})
@@ -104,7 +110,8 @@ def test_the_thread_ends_with_the_last_map() -> None:
     view = Looks()
     reporter = ProgressReporter(lambda: view)
     item = item_of(Future())
-    reporter.show(item, "f", range(3), lambda: 0)
+    reporter.show(item, counting(item, 3, reporter))
+    assert wait_until(lambda: bool(view.shown), PATIENCE)
     assert view.shown[0].total == 3
     assert item.future is not None
     item.future.add_results(0, [1, 2, 3], False)
@@ -119,7 +126,7 @@ def test_a_finished_map_is_shown_at_once_and_once() -> None:
     view = Looks()
     reporter = ProgressReporter(lambda: view)
     item = item_of(Future())
-    reporter.show(item, "f", iter(()), lambda: 0)
+    reporter.show(item, counting(item, None, reporter))
     reporter.finish(item)
     assert view.last is not None
     view.last = None
