@@ -93,10 +93,7 @@ def _is_notebook() -> bool:
 
 
 class LateView:
-    """View that is made when its map has run for ``after`` seconds.
-
-    A map that ends earlier shows nothing, unless ``after`` is 0.
-    """
+    """View that is made when its map has run for ``after`` seconds: a shorter map shows nothing."""
 
     def __init__(self, make_view: Callable[[], View], after: float) -> None:
         self._make_view = make_view
@@ -105,17 +102,18 @@ class LateView:
 
     def show(self, progress: MapProgress) -> None:
         """Show the progress, unless the map is young."""
-        if self._view is None and progress.seconds >= self._after:
-            self._view = self._make_view()
-        if self._view is not None:
-            self._view.show(progress)
+        if view := self._made(progress):
+            view.show(progress)
 
     def finish(self, progress: MapProgress) -> None:
         """Show the last progress, unless the map was young."""
-        if self._view is None and not self._after:
+        if view := self._made(progress):
+            view.finish(progress)
+
+    def _made(self, progress: MapProgress) -> View | None:
+        if self._view is None and progress.seconds >= self._after:
             self._view = self._make_view()
-        if self._view is not None:
-            self._view.finish(progress)
+        return self._view
 
 
 class BarView:
