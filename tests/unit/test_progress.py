@@ -86,7 +86,7 @@ def is_shown() -> bool:
 
 def test_results_are_counted_and_passed_on() -> None:
     future = Future()
-    counted = ProgressFuture(item_of(future), "f", 4, lambda: 3)
+    counted = ProgressFuture(item_of(future), "f", 4, lambda: 3, bool)
     assert counted.add_results(0, [1, 2], False, 9)
     assert counted.add_results(2, [TaskFailure(ValueError()), 4], True)
     found = counted.look()
@@ -100,7 +100,7 @@ def test_results_are_counted_and_passed_on() -> None:
 
 def test_a_map_that_fails_is_over() -> None:
     future, error = Future(), ValueError()
-    counted = ProgressFuture(item_of(future), "f", None, lambda: 0)
+    counted = ProgressFuture(item_of(future), "f", None, lambda: 0, bool)
     counted.set_exception(error)
     assert counted.is_over
     assert future.seen == [error]

@@ -167,7 +167,7 @@ class Broken:
 def test_a_view_that_raises_is_left_out() -> None:
     reporter = ProgressReporter(Broken)
     made = item()
-    reporter.show(made, progress.ProgressFuture(made, "f", 3, lambda: 0))
+    reporter.show(made, progress.ProgressFuture(made, "f", 3, lambda: 0, bool))
     reporter.finish(made)
     assert wait_until(lambda: not is_shown(), PATIENCE)
 

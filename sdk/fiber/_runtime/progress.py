@@ -55,7 +55,7 @@ class ProgressFuture:
         name: str,
         total: int | None,
         busy: Busy,
-        on_over: Callable[[], None] = lambda: None,
+        on_over: Callable[[], object],
     ) -> None:
         """``on_over`` is called, on the loop thread, when the map is over."""
         assert item.future is not None
@@ -130,7 +130,8 @@ class ProgressReporter:
             self._shown[key] = source, LateView(self._make_view, QUIET if late else 0.0)
             with contextlib.suppress(RuntimeError):  # no room for a thread: the end is shown
                 self._start()
-        self._wake.set()
+        if not late:
+            self._wake.set()
 
     def finish(self, key: object) -> None:
         """Show the last state, if it is not shown yet: the caller goes on and may print."""
@@ -144,7 +145,6 @@ class ProgressReporter:
                 self._draw(key, view.finish, source)
             finally:  # not earlier: another thread may wait for the last state
                 self._shown.pop(key, None)
-        self._wake.set()
 
     def look(self) -> None:
         """Show the present state of all maps, and finish those that are over."""
@@ -169,11 +169,11 @@ class ProgressReporter:
 
     def _run(self) -> None:
         while True:
-            self._wake.wait(INTERVAL)
+            woken = self._wake.wait(INTERVAL)
             self._wake.clear()
             with self._lock:
                 self.look()
-                if not self._shown:
+                if not (self._shown or woken):  # not earlier: the next map of a loop uses it, too
                     self._thread = None
                     return
 
@@ -222,8 +222,8 @@ def follow(
     if not label and (wanted is not None or not is_configured()):
         return
     name = label or item.function.name
-    source = ProgressFuture(item, name, _total(iterables), busy, reporter.wake)
-    item.future = source
+    on_over = reporter.wake if label else bool  # a late view has time until the next look
+    item.future = source = ProgressFuture(item, name, _total(iterables), busy, on_over)
     reporter.show(item, source, late=not label)
 
 
