@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import builtins
+import gc
 import io
 import sys
 import threading
+from functools import partialmethod
 from typing import Any
 
 import pytest
@@ -26,6 +28,7 @@ from fiber._runtime.progress_views import (
 from fiber._runtime.work_items import WorkItem
 from fiber._wire import work
 from patience import PATIENCE
+from terminal import drawn
 
 
 class Future:
@@ -220,3 +223,43 @@ def test_a_bar_shows_the_counts(
     view.finish(progress(done=10, failed=1, seconds=1.0))
     assert "10/10" in terminal.getvalue()
     assert "1 failed" in terminal.getvalue()
+
+
+def test_a_bar_that_appears_late_counts_from_the_maps_begin(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pytest.importorskip("tqdm", reason="tqdm is optional, as for users")
+    terminal = use_terminal(monkeypatch)
+    BarView().finish(progress(done=5, seconds=3600.0))
+    assert "[1:00:0" in terminal.getvalue()
+
+
+def test_a_bar_that_tqdm_has_disabled_shows_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    tqdm = pytest.importorskip("tqdm.auto", reason="tqdm is optional, as for users").tqdm
+    monkeypatch.setattr(tqdm, "__init__", partialmethod(tqdm.__init__, disable=True))
+    terminal = use_terminal(monkeypatch)
+    BarView().finish(progress(done=5))
+    assert terminal.getvalue() == ""
+
+
+def test_a_bar_that_is_dropped_draws_no_last_state(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in a forked process, whose copy would write to the terminal of the program."""
+    pytest.importorskip("tqdm", reason="tqdm is optional, as for users")
+    terminal = use_terminal(monkeypatch)
+    view = BarView()
+    view.show(progress(done=5))
+    before = terminal.getvalue()
+    del view
+    gc.collect()
+    assert terminal.getvalue() == before
+
+
+def test_bars_of_rich_share_a_display(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = use_terminal(monkeypatch)
+    first, second = RichView(), RichView()
+    first.show(progress(name="first"))
+    second.show(progress(name="second"))
+    first.finish(progress(name="first", done=10))
+    second.finish(progress(name="second", done=10))
+    assert sys.stderr is terminal
+    assert [line.split()[0] for line in drawn(terminal.getvalue()) if line] == ["first", "second"]

@@ -138,6 +138,8 @@ class BarView:
             self._bar = self._type(
                 desc=progress.name, total=progress.total, unit="task", dynamic_ncols=True
             )
+            if not self._bar.disable:  # by a variable of tqdm
+                self._bar.start_t -= progress.seconds
         self._bar.total = progress.total
         self._bar.n = progress.done
         self._bar.set_postfix_str(facts(progress), refresh=False)
