@@ -126,48 +126,40 @@ with fiber.Pool(1) as pool:
     assert "3/3" in bars(window, "said")[-1]
 
 
-def test_prints_of_the_program_are_above_a_bar_of_rich(tmp_path: Path) -> None:
-    body = """
+def print_beside_a_bar(folder: Path, statement: str, *, view: str, begin: str = "") -> list[str]:
+    """Run a statement while there is a bar, and return the lines of the terminal."""
+    body = f"""{begin}
 with fiber.Pool(1) as pool:
-    result = pool.map_async(wait_for, ["a"], progress="slow")
-    print("printed", flush=True)
-    open("a", "w").close()
+    result = pool.map_async(wait_for, ["end"], progress="slow")
+    wait_for("drawn")
+    {statement}
+    open("end", "w").close()
     result.get()
 """
-    with run(tmp_path, body, view="rich", backend="local") as window:
+    with run(folder, body, view=view, backend="local") as window:
+        window.shows("slow")
+        (folder / "drawn").touch()
         assert window.ends() == 0, window.lines()
     lines = [line for line in window.lines() if line]
-    assert lines[0] == "printed"
-    assert "1/1" in lines[1]
+    assert "1/1" in lines[-1]
+    return lines[:-1]
+
+
+def test_prints_of_the_program_are_above_a_bar_of_rich(tmp_path: Path) -> None:
+    assert print_beside_a_bar(tmp_path, "print('printed')", view="rich") == ["printed"]
 
 
 def test_output_to_a_file_stays_whole_beside_a_bar_of_rich(tmp_path: Path) -> None:
-    body = """
-sys.stdout = open("output", "w")
-with fiber.Pool(1) as pool:
-    result = pool.map_async(wait_for, ["a"], progress="slow")
-    print("printed", flush=True)
-    open("a", "w").close()
-    result.get()
-"""
-    with run(tmp_path, body, view="rich", backend="local") as window:
-        assert window.ends() == 0, window.lines()
+    to_file = "sys.stdout = open('output', 'w')\n"
+    lines = print_beside_a_bar(tmp_path, "print('printed')", view="rich", begin=to_file)
+    assert lines == []
     assert (tmp_path / "output").read_text() == "printed\n"
 
 
 def test_write_of_tqdm_is_above_the_bar(tmp_path: Path) -> None:
+    statement = "import tqdm; tqdm.tqdm.write('one'); tqdm.tqdm.write('two')"
     pytest.importorskip("tqdm", reason="tqdm is optional, as for users")
-    body = """
-import tqdm
-with fiber.Pool(1) as pool:
-    for number in pool.imap(square, range(3), progress="squares"):
-        tqdm.tqdm.write(f"result {number}")
-"""
-    with run(tmp_path, body, view="tqdm", backend="local") as window:
-        assert window.ends() == 0, window.lines()
-    lines = [line for line in window.lines() if line]
-    assert lines[:3] == ["result 0", "result 1", "result 4"]
-    assert "3/3" in lines[3]
+    assert print_beside_a_bar(tmp_path, statement, view="tqdm") == ["one", "two"]
 
 
 # ---- the configuration

@@ -243,7 +243,7 @@ def test_a_bar_that_tqdm_has_disabled_shows_nothing(monkeypatch: pytest.MonkeyPa
 
 
 def test_a_bar_that_is_dropped_draws_no_last_state(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As in a forked process, whose copy would write to the terminal of the program."""
+    # A forked process has a copy, which would write to the terminal of the program.
     pytest.importorskip("tqdm", reason="tqdm is optional, as for users")
     terminal = use_terminal(monkeypatch)
     view = BarView()
