@@ -36,6 +36,7 @@ from typing import Any, ParamSpec, TypeVar
 from fiber import cpu, errors
 from fiber._exceptions import fresh, report_uncaught
 from fiber._runtime import options, start_methods
+from fiber._runtime import progress as reports
 from fiber._runtime.answers import Pickled, TaskFailure
 from fiber._runtime.executor import PoolExecutor
 from fiber._runtime.executor_group import ExecutorGroup, broken, refusal
@@ -203,6 +204,7 @@ class Executor(concurrent.futures.Executor):
         timeout: float | None = None,
         chunksize: int = 1,
         buffersize: int | None = None,
+        progress: bool | str | None = None,
     ) -> Iterator[_T]:
         """Return an iterator over ``fn(*items) for items in zip(*iterables)``, in order.
 
@@ -210,6 +212,7 @@ class Executor(concurrent.futures.Executor):
         ends with the first error, and cancels the tasks that have not begun.  ``chunksize`` items
         go to one worker together.  Another thread reads iterators, a little faster than their tasks
         run.  With ``buffersize`` it reads at most so many items ahead of the results taken.
+        ``progress`` as in ``Pool.map``.
         """
         deadline = None if timeout is None else time.monotonic() + timeout
         ahead = options.buffersize(buffersize)
@@ -231,6 +234,7 @@ class Executor(concurrent.futures.Executor):
         except Exception as error:  # it does not pickle
             engine.reject(results._buffer, error)
             return _taken(results, engine, None, deadline)
+        reports.follow(item, progress, iterables, engine.workers.busy)
         results._begin(engine, item, source, ahead)
         return _taken(results, engine, item, deadline)
 
@@ -465,6 +469,7 @@ def _taken(
     finally:
         if item is not None:
             engine.cancel(item)
+            reports.reporter.finish(item)
 
 
 def _next(results: IMapIterator[Any], engine: PoolExecutor, deadline: float | None) -> list[Any]:

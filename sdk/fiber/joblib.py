@@ -19,6 +19,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import os
+import time
 import weakref
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
@@ -30,6 +31,8 @@ from fiber import cpu
 from fiber._hub import shared_blocks
 from fiber._hub.shared_blocks import SharedBuffer
 from fiber._installation import explained_if_missing
+from fiber._runtime import progress
+from fiber._runtime.progress_views import MapProgress
 from fiber._runtime.state import runtime
 from fiber.futures import Executor
 
@@ -94,6 +97,8 @@ class FiberBackend(AutoBatchingMixin, ParallelBackendBase):  # type: ignore[misc
         self._loops: deque[None] = deque()
         """An entry for each loop that runs: nested generators share one backend."""
         self._unfinished: set[Future[Any]] = set()
+        self._progress: LoopProgress | None = None
+        """Progress of the loop that is shown.  Loops inside it are not."""
 
     def effective_n_jobs(self, n_jobs: int | None) -> int:
         """Return the number of tasks that run at a time."""
@@ -118,6 +123,18 @@ class FiberBackend(AutoBatchingMixin, ParallelBackendBase):  # type: ignore[misc
             self._arguments = MemmappedArguments(options, same_host=runtime().backend.same_host)
         self._loops.append(None)
         return n_jobs
+
+    def start_call(self) -> None:
+        """Show the progress of a loop if the configuration wants it, and ``verbose`` does not."""
+        if self._progress is None and progress.is_configured() and not self.parallel.verbose:
+            assert self._workers is not None
+            self._progress = LoopProgress(self.parallel, self._workers)
+            progress.reporter.show(self._progress, self._progress, late=True)
+
+    def stop_call(self) -> None:
+        """Show the last progress of a loop."""
+        shown, self._progress = self._progress, None
+        progress.reporter.finish(shown)
 
     def submit(self, func: Callable[[], Any], callback: Any = None) -> Future[Any]:
         """Run a batch of tasks; call ``callback`` with its future at the end."""
@@ -174,6 +191,28 @@ class FiberBackend(AutoBatchingMixin, ParallelBackendBase):  # type: ignore[misc
         if self._own is None or not self._own.was_made_with(wanted):
             self._own = _take(wanted) or _Own(*wanted)
         return self._own.executor
+
+
+class LoopProgress:
+    """Progress of one loop, from the counts of its ``Parallel``.  A ``ProgressSource``."""
+
+    is_over = False
+    """``stop_call`` ends it."""
+
+    def __init__(self, parallel: Any, workers: Executor) -> None:
+        self._parallel = parallel
+        self._workers = workers
+        self._began = time.monotonic()
+
+    def look(self) -> MapProgress:
+        """Return the progress now."""
+        loop = self._parallel
+        total = getattr(loop, "n_tasks", None)
+        if total is None and getattr(loop, "_original_iterator", None) is None:  # all dispatched
+            total = loop.n_dispatched_tasks
+        busy = sum(each.workers.busy() for each in self._workers._group.executors())
+        seconds = time.monotonic() - self._began
+        return MapProgress("joblib", loop.n_completed_tasks, total, 0, 0, busy, seconds)
 
 
 class _Own:

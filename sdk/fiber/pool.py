@@ -223,7 +223,7 @@ class Pool:
         chunksize: int | None = None,
         *,
         timeout: float | None = None,
-        progress: bool | str = False,
+        progress: bool | str | None = None,
     ) -> list[_T]:
         """Return ``[func(x) for x in iterable]``; workers run the calls.
 
@@ -232,7 +232,8 @@ class Pool:
         ``apply``, is for each single task.
 
         ``progress=True`` shows the progress on the standard error stream, and a text names it: by a
-        bar of tqdm or rich in a terminal or notebook, by a line every ten seconds elsewhere.
+        bar of tqdm or rich in a terminal or notebook, by a line every ten seconds elsewhere.  None
+        stands for the configuration, which by default shows none.
         """
         return self._map(work.MAP, func, iterable, chunksize, timeout, progress)
 
@@ -243,7 +244,7 @@ class Pool:
         chunksize: int | None = None,
         *,
         timeout: float | None = None,
-        progress: bool | str = False,
+        progress: bool | str | None = None,
     ) -> list[_T]:
         """Return ``[func(*x) for x in iterable]``, otherwise as ``map``."""
         return self._map(work.STAR, func, iterable, chunksize, timeout, progress)
@@ -257,7 +258,7 @@ class Pool:
         error_callback: _ErrorCallback | None = None,
         *,
         timeout: float | None = None,
-        progress: bool | str = False,
+        progress: bool | str | None = None,
     ) -> MapResult[_T]:
         """Call as ``map`` does, but return a result once ``iterable`` is read.
 
@@ -280,7 +281,7 @@ class Pool:
         error_callback: _ErrorCallback | None = None,
         *,
         timeout: float | None = None,
-        progress: bool | str = False,
+        progress: bool | str | None = None,
     ) -> MapResult[_T]:
         """Call as ``starmap`` does, but return at once with a result to wait for."""
         result = MapResult(self, callback, error_callback)
@@ -295,7 +296,7 @@ class Pool:
         *,
         timeout: float | None = None,
         buffersize: int | None = None,
-        progress: bool | str = False,
+        progress: bool | str | None = None,
     ) -> IMapIterator[_T]:
         """Return an iterator over the results of ``func(x) for x in iterable``, in order.
 
@@ -314,7 +315,7 @@ class Pool:
         *,
         timeout: float | None = None,
         buffersize: int | None = None,
-        progress: bool | str = False,
+        progress: bool | str | None = None,
     ) -> IMapIterator[_T]:
         """Call as ``imap`` does, and yield results in the order in which they come."""
         iterator: IMapIterator[_T] = IMapUnorderedIterator(self)
@@ -329,7 +330,7 @@ class Pool:
         iterable: Iterable[Any],
         chunksize: int | None,
         timeout: float | None,
-        progress: bool | str,
+        progress: bool | str | None,
     ) -> list[_T]:
         self._check_may_wait()
         result: MapResult[_T] = MapResult(self)
@@ -347,8 +348,7 @@ class Pool:
                 self._executor.cancel(item)
                 raise
             finally:
-                if progress:
-                    reports.reporter.finish(item)
+                reports.reporter.finish(item)
         return result.get()
 
     def _map_async(
@@ -358,12 +358,17 @@ class Pool:
         iterable: Iterable[Any],
         chunksize: int | None,
         timeout: float | None,
-        progress: bool | str,
+        progress: bool | str | None,
         result: MapResult[_T],
     ) -> None:
         item = self._item(kind, func, result, chunksize, timeout, progress, iterable)
         if item is not None:
-            self._submit(item, iterable, chunksize)
+            result._finish = finish = partial(reports.reporter.finish, item)
+            try:
+                self._submit(item, iterable, chunksize)
+            except BaseException:
+                finish()
+                raise
 
     def _imap(
         self,
@@ -373,7 +378,7 @@ class Pool:
         chunksize: int,
         timeout: float | None,
         buffersize: int | None,
-        progress: bool | str,
+        progress: bool | str | None,
     ) -> IMapIterator[_T]:
         buffersize = options.buffersize(buffersize)
         chunksize = options.chunksize(chunksize)
@@ -389,7 +394,7 @@ class Pool:
         future: Any,
         chunksize: int | None,
         timeout: float | None,
-        progress: bool | str,
+        progress: bool | str | None,
         iterable: Iterable[Any],
     ) -> WorkItem | None:
         """Return the work item of a map.
@@ -404,7 +409,6 @@ class Pool:
         except Exception as error:
             self._executor.reject(future, error)
             return None
-        label = options.label(progress, function.name)
         item = WorkItem(
             kind,
             function=function,
@@ -413,8 +417,7 @@ class Pool:
             eager=chunksize == 1,
             timeout=limit,
         )
-        if label:
-            reports.reporter.show(item, label, iterable, self._executor.workers.busy)
+        reports.follow(item, progress, [iterable], self._executor.workers.busy)
         return item
 
     def _submit(self, item: WorkItem, iterable: Iterable[Any], chunksize: int | None) -> None:
@@ -529,6 +532,7 @@ def _end(executor: PoolExecutor) -> None:
     executor.terminate(_terminated())
     if not (executor.on_loop() or executor.threads.pickling.runs_here()):
         executor.ended.wait()
+        reports.reporter.look()
 
 
 def _terminated() -> FiberError:

@@ -17,6 +17,7 @@ from multiprocessing import TimeoutError
 from typing import Any, Generic, Protocol, Self, TypeVar
 
 from fiber._exceptions import fresh
+from fiber._runtime import progress
 from fiber._runtime.answers import Pickled, TaskFailure, decode, is_failure
 from fiber._runtime.executor import PoolExecutor
 from fiber._runtime.threads import Latch, Waiters, acquire
@@ -200,6 +201,14 @@ class MapResult(ApplyResult[list[_T]]):
         super().__init__(pool, callback, error_callback)
         self._outcome = []
         self._first: Any = None
+        self._finish: Callable[[], None] | None = None
+        """Function that shows the last progress of the map."""
+
+    def wait(self, timeout: float | None = None) -> None:
+        """Wait until the results are there or ``timeout`` seconds are over."""
+        super().wait(timeout)
+        if self._finish is not None and self.ready():
+            self._finish()
 
     def add_results(self, start: int, outcomes: list[Any], mixed: bool, size: int = 0) -> bool:
         """Take outcomes."""
@@ -388,6 +397,8 @@ class IMapIterator(Iterator[_T]):
 
     _buffer_type: type[_ResultBuffer] = _OrderedResultBuffer
     _cancel: Callable[[], None] | None = None
+    _item: WorkItem | None = None
+    """Work item of the map, once it has begun."""
 
     def __init__(self, pool: Keeper) -> None:
         self._buffer = self._buffer_type(pool)
@@ -411,9 +422,16 @@ class IMapIterator(Iterator[_T]):
         try:
             outcome = buffer.items.popleft()
         except IndexError:
-            outcome = buffer.wait(timeout)
+            outcome = self._wait(timeout)
         buffer.ask()
         return outcome.decode() if type(outcome) is Pickled else outcome
+
+    def _wait(self, timeout: float | None) -> Any:
+        try:
+            return self._buffer.wait(timeout)
+        except StopIteration:
+            progress.reporter.finish(self._item)  # now, as the reader may print
+            raise
 
     def _begin(
         self,
@@ -425,11 +443,12 @@ class IMapIterator(Iterator[_T]):
         """Start the map of ``iterable``: ``item`` has this buffer as its future."""
         buffer = self._buffer
         buffer.resume = partial(executor.resume, item)
-        if buffersize is None and isinstance(iterable, (*SLICEABLE, list)):
-            tasks = tuple(iterable) if isinstance(iterable, list) else iterable
-            executor.submit(item, tasks)
-            return
+        self._item = item
         try:
+            if buffersize is None and isinstance(iterable, (*SLICEABLE, list)):
+                tasks = tuple(iterable) if isinstance(iterable, list) else iterable
+                executor.submit(item, tasks)
+                return
             stream = executor.open_stream(item, buffersize, buffer.consumed)
             if buffersize is not None:
                 buffer.stream = stream
@@ -437,6 +456,7 @@ class IMapIterator(Iterator[_T]):
             executor.read(item, iterable)
         except BaseException:  # the executor would wait for a stream without a reader
             executor.cancel(item)
+            progress.reporter.finish(item)
             raise
 
     def __del__(self) -> None:

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
-import pty
-import select
 import subprocess
 import sys
-import time
-from collections.abc import Iterator
 from pathlib import Path
 
 from e2e.program import Programs
 from e2e.scene import Scene
 from fiber_api import names
 from patience import PATIENCE
+from terminal import Terminal
 
 FIBER = Path(sys.executable).with_name("fiber")
 COUNT = """
@@ -57,59 +53,6 @@ if __name__ == "__main__":
 """
 
 
-class Terminal:
-    """Window of a terminal, in which a command runs."""
-
-    CTRL_C = b"\x03"
-
-    def __init__(self, command: list[str], folder: Path, environment: dict[str, str]) -> None:
-        self.shown = ""
-        self._window, inside = pty.openpty()
-        self._process = subprocess.Popen(
-            ["setsid", "--ctty", *command],
-            cwd=folder,
-            env=environment,
-            stdin=inside,
-            stdout=inside,
-            stderr=inside,
-        )
-        os.close(inside)
-
-    def shows(self, words: str) -> None:
-        """Wait until the window shows these words, after those of the last call."""
-        deadline = time.monotonic() + PATIENCE
-        while words not in self.shown:
-            assert self._read(deadline), f"ended without {words!r}: {self.shown}"
-        self.shown = self.shown.partition(words)[2]
-
-    def press(self, key: bytes) -> None:
-        os.write(self._window, key)
-
-    def ends(self) -> int:
-        """Wait until the command ends, and return its exit status."""
-        deadline = time.monotonic() + PATIENCE
-        while self._read(deadline):
-            pass
-        return self._process.wait(PATIENCE)
-
-    def close(self) -> None:
-        """Close the window, which hangs up on the command."""
-        if self._window >= 0:
-            os.close(self._window)
-            self._window = -1
-        self._process.wait(PATIENCE)
-
-    def _read(self, deadline: float) -> bool:
-        """Read what comes next; return False at the end of the command."""
-        ready, _, _ = select.select([self._window], [], [], max(0.0, deadline - time.monotonic()))
-        assert ready, f"nothing more came: {self.shown}"
-        with contextlib.suppress(OSError):  # the last process has closed the terminal
-            data = os.read(self._window, 65536)
-            self.shown += data.decode().replace("\r\n", "\n")
-            return bool(data)
-        return False
-
-
 class Person:
     """A person with a kubeconfig, who may run programs in one namespace."""
 
@@ -145,14 +88,9 @@ class Person:
             text=True,
         )
 
-    @contextlib.contextmanager
-    def terminal(self, *words: str) -> Iterator[Terminal]:
-        """Start a command in a window, and close the window at the end."""
-        terminal = Terminal([str(self._fiber), *words], self.folder, self._environment)
-        try:
-            yield terminal
-        finally:
-            terminal.close()
+    def terminal(self, *words: str) -> Terminal:
+        """Start a command in a window."""
+        return Terminal([str(self._fiber), *words], self.folder, self._environment)
 
     def runs(
         self, *words: str, seconds: float = PATIENCE, **variables: str

@@ -271,7 +271,7 @@ def test_map_keeps_no_result(executor: fiber.Executor) -> None:
 
 
 @pytest.mark.parametrize("wrong", [{"chunksize": 0}, {"buffersize": 0}, {"chunksize": -1}])
-def test_map_refuses_invalid_options(executor: fiber.Executor, wrong: dict[str, int]) -> None:
+def test_map_refuses_invalid_options(executor: fiber.Executor, wrong: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=r"1\+"):
         executor.map(tasks.square, [1], **wrong)
 

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import json
-import os
-import pty
 import signal
 import subprocess
 import sys
-import termios
 from collections.abc import Iterator
-from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -19,9 +15,10 @@ from fakes.kubernetes_api import Call, Fault
 from fakes.program_nodes import kill
 from fiber_api import names
 from patience import PATIENCE
+from terminal import Terminal
 from unit.kubernetes_rig import NAMESPACE
 from unit.pool_command_rig import Outcome
-from unit.run_rig import WAITS, Site, interrupt, read_line, run_site
+from unit.run_rig import COMMAND, WAITS, Site, interrupt, read_line, run_site
 from unit.test_cli_run import refused
 
 NUMBERS = "".join(f"{number}\n" for number in range(20_000))
@@ -356,56 +353,27 @@ def test_ctrl_c_while_attaching_leaves_the_program(site: Site) -> None:
 # ---- terminals and pipes
 
 
-class Terminal:
-    """Terminal in which a command runs a program that waits."""
-
-    def __init__(self, site: Site, *words: str) -> None:
-        site.waits()
-        self.shown = b""
-        self._ours, theirs = pty.openpty()
-        self.command = site.spawn(
-            *words,
-            stdin=theirs,
-            stdout=theirs,
-            stderr=theirs,
-            start_new_session=True,
-            preexec_fn=take_terminal,
-        )
-        os.close(theirs)
-
-    def press(self, key: bytes) -> None:
-        os.write(self._ours, key)
-
-    def read_until(self, word: bytes) -> None:
-        while word not in self.shown:
-            self.shown += os.read(self._ours, 1000)
-
-    def close(self) -> None:
-        os.close(self._ours)
-
-
-def take_terminal() -> None:
-    """Make the standard input the terminal of this session."""
-    import fcntl
-
-    fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+def terminal(site: Site, *words: str) -> Terminal:
+    """Run a command in a terminal; its program waits for Ctrl-C."""
+    site.waits()
+    return Terminal([*COMMAND, *words], site.folder, site.environment)
 
 
 def test_a_killed_terminal_leaves_the_program(site: Site) -> None:
-    with closing(Terminal(site, "run", "--name", "mine", "train.py")) as terminal:
-        terminal.read_until(b"begun")
-    assert terminal.command.wait(PATIENCE) == -signal.SIGHUP
+    with terminal(site, "run", "--name", "mine", "train.py") as window:
+        window.shows("begun")
+    assert window.close() == -signal.SIGHUP
     again = site.begin("run", "--attach", "mine")
     interrupt(again)
     assert site.end(again)[:2] == (9, "interrupted\n")
 
 
 def test_ctrl_c_in_a_terminal(site: Site) -> None:
-    with closing(Terminal(site, "run", "train.py")) as terminal:
-        terminal.read_until(b"begun")
-        terminal.press(b"\x03")
-        terminal.read_until(b"interrupted")
-        assert terminal.command.wait(PATIENCE) == 9
+    with terminal(site, "run", "train.py") as window:
+        window.shows("begun")
+        window.press(window.CTRL_C)
+        window.shows("interrupted")
+        assert window.ends() == 9
 
 
 def test_a_closed_pipe_ends_the_program(site: Site) -> None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import builtins
+import gc
 import io
 import sys
 import threading
+from functools import partialmethod
 from typing import Any
 
 import pytest
@@ -26,6 +28,7 @@ from fiber._runtime.progress_views import (
 from fiber._runtime.work_items import WorkItem
 from fiber._wire import work
 from patience import PATIENCE
+from terminal import drawn
 
 
 class Future:
@@ -69,6 +72,12 @@ def item_of(future: Future) -> WorkItem:
     return WorkItem(work.MAP, future=future)
 
 
+def counting(item: WorkItem, total: int | None, reporter: ProgressReporter) -> ProgressFuture:
+    """Put a future that counts before the future of a map."""
+    item.future = made = ProgressFuture(item, "f", total, lambda: 0, reporter.wake)
+    return made
+
+
 def progress(**facts: Any) -> MapProgress:
     usual = {"name": "f", "done": 0, "total": 10, "failed": 0, "lost": 0, "busy": 0, "seconds": 0.0}
     return MapProgress(**{**usual, **facts})
@@ -80,7 +89,7 @@ def is_shown() -> bool:
 
 def test_results_are_counted_and_passed_on() -> None:
     future = Future()
-    counted = ProgressFuture(item_of(future), "f", 4, lambda: 3)
+    counted = ProgressFuture(item_of(future), "f", 4, lambda: 3, bool)
     assert counted.add_results(0, [1, 2], False, 9)
     assert counted.add_results(2, [TaskFailure(ValueError()), 4], True)
     found = counted.look()
@@ -94,7 +103,7 @@ def test_results_are_counted_and_passed_on() -> None:
 
 def test_a_map_that_fails_is_over() -> None:
     future, error = Future(), ValueError()
-    counted = ProgressFuture(item_of(future), "f", None, lambda: 0)
+    counted = ProgressFuture(item_of(future), "f", None, lambda: 0, bool)
     counted.set_exception(error)
     assert counted.is_over
     assert future.seen == [error]
@@ -104,7 +113,8 @@ def test_the_thread_ends_with_the_last_map() -> None:
     view = Looks()
     reporter = ProgressReporter(lambda: view)
     item = item_of(Future())
-    reporter.show(item, "f", range(3), lambda: 0)
+    reporter.show(item, counting(item, 3, reporter))
+    assert wait_until(lambda: bool(view.shown), PATIENCE)
     assert view.shown[0].total == 3
     assert item.future is not None
     item.future.add_results(0, [1, 2, 3], False)
@@ -119,7 +129,7 @@ def test_a_finished_map_is_shown_at_once_and_once() -> None:
     view = Looks()
     reporter = ProgressReporter(lambda: view)
     item = item_of(Future())
-    reporter.show(item, "f", iter(()), lambda: 0)
+    reporter.show(item, counting(item, None, reporter))
     reporter.finish(item)
     assert view.last is not None
     view.last = None
@@ -213,3 +223,43 @@ def test_a_bar_shows_the_counts(
     view.finish(progress(done=10, failed=1, seconds=1.0))
     assert "10/10" in terminal.getvalue()
     assert "1 failed" in terminal.getvalue()
+
+
+def test_a_bar_that_appears_late_counts_from_the_maps_begin(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pytest.importorskip("tqdm", reason="tqdm is optional, as for users")
+    terminal = use_terminal(monkeypatch)
+    BarView().finish(progress(done=5, seconds=3600.0))
+    assert "[1:00:0" in terminal.getvalue()
+
+
+def test_a_bar_that_tqdm_has_disabled_shows_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    tqdm = pytest.importorskip("tqdm.auto", reason="tqdm is optional, as for users").tqdm
+    monkeypatch.setattr(tqdm, "__init__", partialmethod(tqdm.__init__, disable=True))
+    terminal = use_terminal(monkeypatch)
+    BarView().finish(progress(done=5))
+    assert terminal.getvalue() == ""
+
+
+def test_a_bar_that_is_dropped_draws_no_last_state(monkeypatch: pytest.MonkeyPatch) -> None:
+    # A forked process has a copy, which would write to the terminal of the program.
+    pytest.importorskip("tqdm", reason="tqdm is optional, as for users")
+    terminal = use_terminal(monkeypatch)
+    view = BarView()
+    view.show(progress(done=5))
+    before = terminal.getvalue()
+    del view
+    gc.collect()
+    assert terminal.getvalue() == before
+
+
+def test_bars_of_rich_share_a_display(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = use_terminal(monkeypatch)
+    first, second = RichView(), RichView()
+    first.show(progress(name="first"))
+    second.show(progress(name="second"))
+    first.finish(progress(name="first", done=10))
+    second.finish(progress(name="second", done=10))
+    assert sys.stderr is terminal
+    assert [line.split()[0] for line in drawn(terminal.getvalue()) if line] == ["first", "second"]

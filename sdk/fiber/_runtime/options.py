@@ -135,8 +135,8 @@ def exceptions(
 
 
 def label(progress: Any, name: str) -> str:
-    """Return the label of a map whose progress is to be shown; empty if it is not."""
-    if not isinstance(progress, bool | str):
+    """Return the label of a map whose call asks to show its progress; else an empty text."""
+    if progress is not None and not isinstance(progress, bool | str):
         raise TypeError(f"progress must be True, False or a text, not {progress!r}")
     return progress if isinstance(progress, str) else name if progress else ""
 

@@ -1,7 +1,8 @@
 """Views of a map's progress: a bar of tqdm, a bar of rich, or lines.
 
 tqdm draws in terminals and notebooks, where it is installed.  rich draws in terminals.  Everywhere
-else, as in a pipe or in continuous integration, a line is printed now and then.
+else, as in a pipe or in continuous integration, a line is printed now and then.  So it is in
+children, whose bars would overwrite each other and the program's.
 """
 
 from __future__ import annotations
@@ -9,12 +10,16 @@ from __future__ import annotations
 import contextlib
 import sys
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from multiprocessing.process import parent_process
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 from fiber import _logs
 
 LINE_INTERVAL = 10.0
 """Seconds between two lines."""
+
+QUIET = 0.5
+"""Seconds that a map runs before a ``LateView`` of it appears."""
 
 
 class MapProgress(NamedTuple):
@@ -58,13 +63,23 @@ class View(Protocol):
 
 def choose_view() -> View:
     """Return a view that fits the standard error stream and the installed packages."""
-    if _is_notebook() or _is_terminal():
-        with contextlib.suppress(ImportError):
+    if is_interactive() and not is_child():
+        with contextlib.suppress(Exception):  # not installed, or its installation is broken
             return BarView()
         if _is_terminal():
-            with contextlib.suppress(ImportError):
+            with contextlib.suppress(Exception):
                 return RichView()
     return LineView()
+
+
+def is_interactive() -> bool:
+    """Return whether the standard error stream is a terminal or a notebook."""
+    return _is_notebook() or _is_terminal()
+
+
+def is_child() -> bool:
+    """Return whether this process is a child of a program, as a worker is."""
+    return parent_process() is not None
 
 
 def _is_terminal() -> bool:
@@ -77,14 +92,43 @@ def _is_notebook() -> bool:
     return "ipykernel" in sys.modules and type(sys.stderr).__module__.startswith("ipykernel")
 
 
+class LateView:
+    """View that is made when its map has run for ``after`` seconds: a shorter map shows nothing."""
+
+    def __init__(self, make_view: Callable[[], View], after: float) -> None:
+        self._make_view = make_view
+        self._after = after
+        self._view: View | None = None
+
+    def show(self, progress: MapProgress) -> None:
+        """Show the progress, unless the map is young."""
+        if view := self._made(progress):
+            view.show(progress)
+
+    def finish(self, progress: MapProgress) -> None:
+        """Show the last progress, unless the map was young."""
+        if view := self._made(progress):
+            view.finish(progress)
+
+    def _made(self, progress: MapProgress) -> View | None:
+        if self._view is None and progress.seconds >= self._after:
+            self._view = self._make_view()
+        return self._view
+
+
 class BarView:
     """Bar of ``tqdm.auto``.  Lines of workers on other hosts are written above it."""
 
     def __init__(self) -> None:
         from tqdm.auto import tqdm  # type: ignore[import-untyped]
 
-        # tqdm starts a thread that looks after slow bars, unless the type has no interval for it.
-        self._type: Any = type("Bar", (tqdm,), {"monitor_interval": 0})
+        class Bar(tqdm):  # type: ignore[misc]
+            monitor_interval = 0  # else tqdm starts a thread that looks after slow bars
+
+            def __del__(self) -> None:
+                """Draw nothing: the copy of a bar in a forked process is not the last state."""
+
+        self._type: Any = Bar
         self._bar: Any = None
 
     def show(self, progress: MapProgress) -> None:
@@ -94,6 +138,8 @@ class BarView:
             self._bar = self._type(
                 desc=progress.name, total=progress.total, unit="task", dynamic_ncols=True
             )
+            if not self._bar.disable:  # by a variable of tqdm
+                self._bar.start_t -= progress.seconds
         self._bar.total = progress.total
         self._bar.n = progress.done
         self._bar.set_postfix_str(facts(progress), refresh=False)
@@ -101,42 +147,66 @@ class BarView:
 
     def finish(self, progress: MapProgress) -> None:
         """Draw the bar for the last time."""
-        self.show(progress)
-        self._bar.close()
+        # tqdm takes the lock again.  Without it a ``tqdm.write`` may come between bar and line end.
+        with self._type.get_lock():
+            self.show(progress)
+            self._bar.close()
 
 
 class RichView:
-    """Bar of rich."""
+    """Bar of rich.  The bars of the program share one display, as rich has one at a time."""
+
+    _display: ClassVar[Any] = None
+    _open: ClassVar[int] = 0
+    """Number of bars in the display."""
 
     def __init__(self) -> None:
-        from rich import progress as bars
-        from rich.console import Console
+        import rich.progress  # noqa: F401 - missing packages are noticed here
 
-        self._bars = bars.Progress(
-            "{task.description}",
-            bars.BarColumn(),
-            bars.MofNCompleteColumn(),
-            bars.TimeRemainingColumn(),
-            "{task.fields[facts]}",
-            console=Console(stderr=True),
-            auto_refresh=False,
-        )
         self._task: Any = None
 
     def show(self, progress: MapProgress) -> None:
         """Draw the bar."""
+        display = RichView._display or self._start()
         if self._task is None:
-            self._bars.start()
-            self._task = self._bars.add_task(progress.name, facts="")
-        self._bars.update(
+            self._task = display.add_task(progress.name, total=progress.total, facts="")
+            RichView._open += 1
+        display.update(
             self._task, total=progress.total, completed=progress.done, facts=facts(progress)
         )
-        self._bars.refresh()
+        display.refresh()
 
     def finish(self, progress: MapProgress) -> None:
-        """Draw the bar for the last time."""
+        """Draw the bar for the last time, above those that go on."""
         self.show(progress)
-        self._bars.stop()
+        display = RichView._display
+        RichView._open -= 1
+        if RichView._open:
+            (task,) = (task for task in display.tasks if task.id == self._task)
+            display.console.print(display.make_tasks_table([task]))
+            display.remove_task(self._task)
+        else:
+            RichView._display = None
+            display.stop()
+
+    @staticmethod
+    def _start() -> Any:
+        from rich import progress as bars
+        from rich.console import Console
+
+        RichView._display = display = bars.Progress(
+            bars.TextColumn("{task.description}", markup=False),
+            bars.BarColumn(),
+            bars.MofNCompleteColumn(),
+            bars.TimeRemainingColumn(),
+            bars.TextColumn("{task.fields[facts]}", markup=False),
+            console=Console(stderr=True),
+            auto_refresh=False,
+            # What the program prints appears above the bars.  A file or pipe gets it unchanged.
+            redirect_stdout=sys.stdout is not None and sys.stdout.isatty(),
+        )
+        display.start()
+        return display
 
 
 class LineView:
