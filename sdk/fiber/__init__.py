@@ -51,6 +51,7 @@ __all__ = [
     "Semaphore",
     "SimpleQueue",
     "StartError",
+    "Summary",
     "TimeoutError",
     "TooManyOpenFiles",
     "UnpicklableError",
@@ -75,6 +76,8 @@ __all__ = [
     "set_executable",
     "set_forkserver_preload",
     "set_start_method",
+    "summary",
+    "timeline",
 ]
 
 if TYPE_CHECKING:
@@ -89,6 +92,7 @@ if TYPE_CHECKING:
     from fiber import managers as managers
     from fiber import pool as pool
     from fiber import process as process
+    from fiber import profiling as profiling
     from fiber import queues as queues
     from fiber import reduction as reducer
     from fiber import reduction as reduction
@@ -129,6 +133,7 @@ if TYPE_CHECKING:
     from fiber.futures import Executor
     from fiber.managers import BaseManager
     from fiber.process import Process, active_children, current_process, parent_process
+    from fiber.profiling import Summary, summary, timeline
     from fiber.queues import JoinableQueue, Queue, SimpleQueue
     from fiber.resources import meta
     from fiber.ring import Ring
@@ -173,6 +178,7 @@ _SUBMODULES = frozenset(
         "managers",
         "pool",
         "process",
+        "profiling",
         "queues",
         "reduction",
         "resource_tracker",
@@ -213,6 +219,7 @@ _HOMES = {
     "SUBDEBUG": "util",
     "SUBWARNING": "util",
     "StartError": "errors",
+    "Summary": "profiling",
     "TimeoutError": "errors",
     "TooManyOpenFiles": "errors",
     "UnpicklableError": "errors",
@@ -224,6 +231,8 @@ _HOMES = {
     "init": "config",
     "meta": "resources",
     "parent_process": "process",
+    "summary": "profiling",
+    "timeline": "profiling",
 }
 
 

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 _INSTALLED_BY = {
     "gymnasium": "'fiberpool[vector]'",
     "joblib": "'fiberpool[joblib]'",
+    "matplotlib": "matplotlib",
     "numpy": "'fiberpool[vector]'",
     "stable_baselines3": "stable-baselines3",
 }

@@ -108,7 +108,9 @@ class Config:
     dashboard*: start the program's live page at its first process, and print the page's address.
         See `fiber dashboard`.
     timeline*: write the program's timeline at its end to this file. The suffix chooses the form, as
-        in `fiber.timeline`.
+        in `fiber.timeline`. `%p` stands for the process id. If another program has written the file
+        since this one began, this one adds its process id to the name. The program's processes
+        write none. If it cannot be written, a line on stderr says why.
     metrics_port*: serve the program's metrics for Prometheus at this port; 0 takes a free one. The
         address is that of `metrics_host`. None serves none.
     metrics_host*: the address at which the metrics are served.

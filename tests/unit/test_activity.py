@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -12,6 +13,8 @@ from hypothesis import strategies as st
 
 from fiber._engine import activity
 from fiber._engine.activity import Activity, ChildRecord, WorkReport
+from fiber._runtime.pool_activity import PoolActivity
+from fiber._transport.loop import Loop
 
 START = 1000.0
 
@@ -52,7 +55,15 @@ def test_totals_of_the_program_of_children_and_of_functions() -> None:
     found = record.snapshot(START + 5)
     assert (found["tasks"], found["failed"], found["now"]) == (5, 1, 5)
     assert found["functions"] == [
-        {"name": "f", "tasks": 5, "failed": 1, "work": 4.0, "longest": 3.0}
+        {
+            "name": "f",
+            "tasks": 5,
+            "failed": 1,
+            "answers": 2,
+            "chunk": 1,
+            "work": 4.0,
+            "longest": 3.0,
+        }
     ]
     assert [(c["tasks"], c["failed"], c["ended"], c["reason"]) for c in found["children"]] == [
         (4, 1, None, ""),
@@ -150,3 +161,14 @@ def test_rates_have_all_tasks_in_a_bounded_history(events: list[tuple[float, int
     assert len(rates["done"]) == len(rates["failed"]) <= 600
     assert sum(rates["done"]) == sum(tasks for _, tasks, _ in events)
     assert sum(rates["failed"]) == sum(failed for _, _, failed in events)
+
+
+def test_pauses_of_a_caller_between_its_calls_are_not_on_the_way(loop: Loop) -> None:
+    record = Activity(START)
+    child = working(record)
+    handle: Any = SimpleNamespace(record=child)
+    work = WorkReport("f", START + 1, START + 5, 0.5, 3, 0, 3)
+    PoolActivity(record, loop).leased(handle, work)
+    assert (child.held, child.work) == (0.5, 0.5)
+    (function,) = record.snapshot(START + 6)["functions"]
+    assert (function["tasks"], function["answers"]) == (3, 3)

@@ -111,7 +111,10 @@ class ChildRecord:
         self.work = 0.0
         """Seconds of work, with unpickling and pickling in the worker."""
         self.held = 0.0
-        """Seconds in which it had tasks.  Without ``work``, they were on the way."""
+        """Seconds in which it had tasks.  Without ``work``, they were on the way.
+
+        A call that its caller sent to the worker itself counts without its way.
+        """
         self.noted = began
         """Time up to which ``held`` counts."""
         self.memory: int | None = None
@@ -125,11 +128,15 @@ class ChildRecord:
 class FunctionTotals:
     """Totals of one function."""
 
-    __slots__ = ("failed", "longest", "name", "tasks", "work")
+    __slots__ = ("answers", "chunk", "failed", "longest", "name", "tasks", "work")
 
     def __init__(self, name: str) -> None:
         self.name = name
         self.tasks = self.failed = 0
+        self.answers = 0
+        """Messages with which workers answered."""
+        self.chunk = 1
+        """Largest chunk of tasks that had to stay together."""
         self.work = 0.0
         self.longest = 0.0
         """Longest time of a task in seconds; of several tasks in one answer, their mean."""
@@ -169,6 +176,10 @@ class WorkReport(NamedTuple):
     """Seconds of work between ``begin`` and ``end``."""
     tasks: int
     failed: int = 0
+    answers: int = 1
+    """Messages with which the worker answered."""
+    chunk: int = 1
+    """Tasks that had to stay together, by the ``chunksize`` of a map."""
 
 
 class Activity:
@@ -241,7 +252,7 @@ class Activity:
 
     def worked(self, record: ChildRecord, work: WorkReport) -> None:
         """Note work that a worker has reported."""
-        function, begin, end, seconds, tasks, failed = work
+        function, begin, end, seconds, tasks, failed, _, _ = work
         record.tasks += tasks
         record.work += seconds
         self.tasks += tasks
@@ -249,7 +260,7 @@ class Activity:
             record.failed += failed
             self.failed += failed
         self.rates.add(end, tasks, failed)
-        self._count(function, seconds, tasks, failed)
+        self._count(work)
         revision = record.changed = self._revision
         spans = record.spans
         if spans:
@@ -269,16 +280,18 @@ class Activity:
         if self._span_count > self._most_spans:
             self._coarsen()
 
-    def _count(self, function: str, seconds: float, tasks: int, failed: int) -> None:
-        totals = self.functions.get(function)
+    def _count(self, work: WorkReport) -> None:
+        totals = self.functions.get(work.function)
         if totals is None:
-            name = function if len(self.functions) < FUNCTIONS else OTHER_FUNCTIONS
+            name = work.function if len(self.functions) < FUNCTIONS else OTHER_FUNCTIONS
             totals = self.functions.setdefault(name, FunctionTotals(name))
-        totals.tasks += tasks
-        totals.failed += failed
-        totals.work += seconds
-        if tasks:
-            totals.longest = max(totals.longest, seconds / tasks)
+        totals.failed += work.failed
+        totals.work += work.seconds
+        if work.tasks:
+            totals.tasks += work.tasks
+            totals.answers += work.answers
+            totals.chunk = max(totals.chunk, work.chunk)
+            totals.longest = max(totals.longest, work.seconds / work.tasks)
 
     # Bounds
 
@@ -345,6 +358,8 @@ class Activity:
                     "name": totals.name,
                     "tasks": totals.tasks,
                     "failed": totals.failed,
+                    "answers": totals.answers,
+                    "chunk": totals.chunk,
                     "work": totals.work,
                     "longest": totals.longest,
                 }

@@ -25,6 +25,10 @@ class ChildOwner(Protocol):
     def state(self) -> str:
         """State of the child in one word, as in ``WorkerInfo``."""
 
+    @property
+    def busy_since(self) -> float | None:
+        """Time since which the child has tasks without an answer; None if it has none."""
+
     def begin(self, child: ChildHandle) -> None:
         """Keep the child's handle, and start it.  The loop calls this first of all."""
 

@@ -112,7 +112,7 @@ class LeasedWorker:
         self.noted = now, calls, failed, seconds
         work, tasks = seconds - seconds_before, calls - calls_before
         begin = max(before, min(now - work, now - UNUSED))
-        return WorkReport(self.function, begin, now, work, tasks, failed - failed_before)
+        return WorkReport(self.function, begin, now, work, tasks, failed - failed_before, tasks)
 
 
 class Lease:

@@ -28,6 +28,7 @@ from types import FrameType
 from typing import Any, TypeVar, cast
 
 from fiber._engine.activity import Activity, ChildRecord
+from fiber._runtime.activity_reading import on_loop, snapshot
 from fiber._runtime.children import Child, Children
 from fiber._runtime.pool_state import WatchedPool
 from fiber._transport.loop import Loop
@@ -35,9 +36,6 @@ from fiber.config import Config
 from fiber.errors import FiberError
 
 T = TypeVar("T")
-
-_LOOP_PATIENCE = 5.0
-"""Seconds in which the loop answers."""
 
 _MEASURE_PATIENCE = 1.0
 """Seconds in which agents measure their children.  Later answers are shown the next time."""
@@ -90,15 +88,7 @@ class Monitor:
         }
 
     def _on_loop(self, function: Callable[[], T]) -> T:
-        """Return the result of a function that runs on the loop thread."""
-        answers: queue.SimpleQueue[T] = queue.SimpleQueue()
-        self._loop.call_soon(lambda: answers.put(function()))
-        try:
-            return answers.get(timeout=_LOOP_PATIENCE)
-        except queue.Empty:
-            raise FiberError(
-                f"the program's event loop has not answered within {_LOOP_PATIENCE:.0f} s"
-            ) from None
+        return on_loop(self._loop, function)
 
     def _measure(self) -> None:
         """Have all children measured; wait for the answers, though not for late ones."""
@@ -132,10 +122,7 @@ class Monitor:
         }
 
     def _snapshot(self, since: int) -> dict[str, Any]:
-        """Return the program's activity; ``start`` is the unix time of its beginning."""
-        now = self._loop.now()
-        start = time.time() - (now - self._activity.start)
-        return {"start": start, **self._activity.snapshot(now, since)}
+        return snapshot(self._activity, self._children, self._loop.now(), since)
 
     def _describe_children(self) -> list[dict[str, Any]]:
         return [_facts(child) for child in self._children]

@@ -61,15 +61,16 @@ class PoolActivity:
         self._activity.bytes_received += size
         failed = sum(map(is_failure, values)) if mixed else 0
         name = CANCELLED if receipt is None else _function(receipt)
+        chunk = 1 if receipt is None else receipt.job.unit
         self._activity.worked(
-            record, WorkReport(name, now - seconds, now, seconds, len(values), failed)
+            record, WorkReport(name, now - seconds, now, seconds, len(values), failed, 1, chunk)
         )
 
     def leased(self, handle: WorkerHandle, work: WorkReport) -> None:
         """Note calls that their callers sent to a worker themselves."""
         record = handle.record
         if record is not None:
-            record.held += work.end - max(work.begin, record.noted)
+            record.held += work.seconds  # the caller may have paused between the calls
             record.noted = work.end
             self._activity.worked(record, work)
 

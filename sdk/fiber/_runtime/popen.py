@@ -127,6 +127,10 @@ class Popen:
         return "starting" if self._pid is None else "running"
 
     @property
+    def busy_since(self) -> None:
+        """None: a process has no tasks."""
+
+    @property
     def leaving(self) -> str:
         """Reason for which the host is about to end; empty if the host stays."""
         child = self._child

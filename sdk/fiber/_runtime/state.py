@@ -38,6 +38,7 @@ from fiber.resources import resources_of
 if TYPE_CHECKING:
     from fiber._agent.interface import Backend
     from fiber._backends.shipping import PackedProgram, Shipping
+    from fiber._runtime.timeline import TimelineAtEnd
 
 _WORTH_SHARING = 1 << 16
 """Bytes of a pickle from which on it is sent once for all processes."""
@@ -60,6 +61,8 @@ class Runtime:
         self.children = Children(self.activity, self.loop.now)
         self.pools: weakref.WeakSet[WatchedPool] = weakref.WeakSet()
         """Executors with workers.  Only the loop thread adds and removes them."""
+        self.timeline: TimelineAtEnd | None = None
+        """Timeline that is written at the end of the program."""
         self._monitor: MonitorServer | None = None
         self._can_be_watched = not child.host
         """True until the loop has opened the monitor, or has found that it cannot."""
@@ -212,6 +215,20 @@ class Runtime:
         if self._shipping is not None:
             self._shipping.program(self._spawn_data("a pool"), anew=True)
 
+    def read_activity(self) -> dict[str, Any]:
+        """Return a snapshot of the activity.  Runs on any thread."""
+        from fiber._runtime.activity_reading import read_activity  # rarely needed
+
+        return read_activity(self.loop, self.activity, self.children)
+
+    def end(self) -> None:
+        """Close, and write the timeline if there is to be one."""
+        if self.timeline is None:
+            self.close()
+        else:
+            with self.timeline.writing(self.read_activity):
+                self.close()
+
     def close(self) -> None:
         """End every child, agent and thread.  Runs on any thread but the loop's."""
         _logs.debug("ending all processes and agents")
@@ -264,6 +281,14 @@ def _make_backend(runtime: Runtime) -> Backend:
 
         return KubernetesBackend(loop, hub, settings)
     return LocalBackend(loop, runtime.host, hub)
+
+
+def _make_timeline(path: str | None) -> TimelineAtEnd | None:
+    if path is None:
+        return None
+    from fiber._runtime.timeline import timeline_at_end  # few programs want one
+
+    return timeline_at_end(path)
 
 
 def _is_on_cluster(settings: config.Config) -> bool:
@@ -321,6 +346,7 @@ def _make() -> None:
         made = Runtime()
         if _runtime is None:  # else a finalizer has made one
             hub_client.set_local_hub(made.hub)
+            made.timeline = _make_timeline(made.config.timeline)
             util.Finalize(None, shutdown, exitpriority=_EXIT_PRIORITY)
             _runtime = made
     finally:
@@ -334,7 +360,17 @@ def shutdown() -> None:
     with _lock:
         ending, _runtime = _runtime, None
     if ending is not None:
-        ending.close()
+        ending.end()
+
+
+def read_activity() -> dict[str, Any]:
+    """Return a snapshot of the program's activity, also before anything was started."""
+    running = _runtime
+    if running is not None:
+        return running.read_activity()
+    from fiber._runtime.activity_reading import no_activity
+
+    return no_activity()
 
 
 def _forget() -> None:

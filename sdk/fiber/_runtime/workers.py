@@ -132,6 +132,12 @@ class WorkerHandle:
             return "starting"
         return "busy" if self.worker.queue or self.worker.leased else "idle"
 
+    @property
+    def busy_since(self) -> float | None:
+        """Time since which the worker has tasks without an answer; None if it has none."""
+        worker = self.worker
+        return worker.since if worker is not None and worker.queue else None
+
     def start(self, process: BaseProcess) -> None:
         """Start the worker as ``process``, a Process object that was made for this handle."""
         process.start()
