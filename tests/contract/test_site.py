@@ -102,7 +102,7 @@ QUESTIONS = {
         "images-of-your-own",
     ),
     ("How do I stop it?", "stop", "cancel"): ("how-do-i-stop-it-or-cancel-a-task",),
-    ("How do I pass data?", "share data", "large arguments"): ("how-do-i-pass-data",),
+    ("How do I pass data?", "share data", "large arguments"): ("how-do-i-pass-data-or-share-data",),
     ("Does it work in a notebook?", "jupyter"): ("does-it-work-in-a-notebook",),
     ("What does it cost on a laptop?", "laptop", "overhead"): ("what-does-it-cost-on-a-laptop",),
     ("How do I run on GPUs?", "gpu", "cuda"): ("how-do-i-run-on-gpus", "gpus"),
