@@ -21,8 +21,8 @@ from fiber_api.schema import schema
 MODULES = sorted({*fiber._SUBMODULES, "joblib"} - {"errors"})
 """Modules with a page of their names. Errors have a page with more."""
 
-_UNSEARCHED = ("fiber.config",)
-"""Pages that the search leaves out. The page of the configuration describes the same keys."""
+_UNSEARCHED = ("fiber.config", "fiber.profiling")
+"""Pages that the search leaves out: guides describe the same names in the words of a question."""
 
 _HEAD = "<!-- Written by python -m docsite. -->\n\n"
 
