@@ -108,9 +108,9 @@ class Config:
         See `fiber dashboard`.
     timeline*: write the program's timeline at its end to this file. The suffix chooses the form, as
         in `fiber.timeline`.
-    metrics_port*: serve the program's metrics for Prometheus at this port; 0 takes a free one. The
-        address is that of `metrics_host`. None serves none.
-    metrics_host*: the address at which the metrics are served.
+    metrics_port*: serve the program's metrics for Prometheus at this port of `metrics_host`. 0
+        takes a free port, and prints the address. None serves none. It needs prometheus-client.
+    metrics_host*: the address at which the metrics are served. In a pod, a scraper needs "0.0.0.0".
     log_to*: also write the output of each worker to a file of its own in this folder.
     log_records*: the least severe level of `logging` records that children send to the program's
         handlers. None sends none.

@@ -141,6 +141,9 @@ def _make_launcher(container: Body, source: Source, options: dict[str, Any]) -> 
         # The kubelet replaces $(NAME) by a variable, and $$ by $.
         variables[name] = {"name": name, "value": value.replace("$", "$$")}
     container["env"] = list(variables.values())
+    if (port := wanted.get("FIBER_METRICS_PORT", "")).isdecimal() and int(port):
+        metrics = {"name": "metrics", "containerPort": int(port)}
+        container["ports"] = [*(container.get("ports") or ()), metrics]
     added = [{"secretRef": {"name": name}} for name in options["secret"]]
     if added:
         container["envFrom"] = [*(container.get("envFrom") or ()), *added]

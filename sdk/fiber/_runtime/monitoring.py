@@ -84,15 +84,7 @@ class Monitor:
         }
 
     def _on_loop(self, function: Callable[[], T]) -> T:
-        """Return the result of a function that runs on the loop thread."""
-        answers: queue.SimpleQueue[T] = queue.SimpleQueue()
-        self._loop.call_soon(lambda: answers.put(function()))
-        try:
-            return answers.get(timeout=_LOOP_PATIENCE)
-        except queue.Empty:
-            raise FiberError(
-                f"the program's event loop has not answered within {_LOOP_PATIENCE:.0f} s"
-            ) from None
+        return ask_loop(self._loop, function)
 
     def _state(self) -> list[dict[str, Any]]:
         pools = [{"pool": pool.describe()._asdict()} for pool in list(self._pools)]
@@ -148,6 +140,18 @@ class Monitor:
                 asked[number] = facts
                 child.ask_for_stack(partial(_put, answers, number))
         return asked
+
+
+def ask_loop(loop: Loop, function: Callable[[], T]) -> T:
+    """Return the result of a function that runs on the loop thread; FiberError if none comes."""
+    answers: queue.SimpleQueue[T] = queue.SimpleQueue()
+    loop.call_soon(lambda: answers.put(function()))
+    try:
+        return answers.get(timeout=_LOOP_PATIENCE)
+    except queue.Empty:
+        raise FiberError(
+            f"the program's event loop has not answered within {_LOOP_PATIENCE:.0f} s"
+        ) from None
 
 
 def _put(answers: queue.SimpleQueue[tuple[int, str]], number: int, text: str) -> None:

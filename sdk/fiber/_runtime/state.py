@@ -38,6 +38,7 @@ from fiber.resources import resources_of
 if TYPE_CHECKING:
     from fiber._agent.interface import Backend
     from fiber._backends.shipping import PackedProgram, Shipping
+    from fiber._runtime.metrics import MetricsServer
 
 _WORTH_SHARING = 1 << 16
 """Bytes of a pickle from which on it is sent once for all processes."""
@@ -61,6 +62,8 @@ class Runtime:
         self.pools: weakref.WeakSet[WatchedPool] = weakref.WeakSet()
         """Executors with workers.  Only the loop thread adds and removes them."""
         self._monitor: MonitorServer | None = None
+        self.metrics: MetricsServer | None = None
+        """Server of the program's metrics, if it was asked for."""
         self._can_be_watched = not child.host
         """True until the loop has opened the monitor, or has found that it cannot."""
         try:
@@ -72,11 +75,23 @@ class Runtime:
                 and not (self._shipping is not None and self._shipping.main_is_sent)
             )
             self.loop.start_thread("fiber-io")
+            self._serve_metrics()
             _logs.debug("%s on host %s", type(self.backend).__name__, self.host)
         except BaseException:
             self._close_hub()
             self.loop.stop()
             raise
+
+    def _serve_metrics(self) -> None:
+        """Serve the metrics, unless this process is a child or a forked copy of a program."""
+        if self.config.metrics_port is None or child.host or _is_copy:
+            return
+        from fiber._runtime import metrics  # rarely needed
+
+        def sample() -> metrics.ProgramSample:
+            return metrics.take_sample(self.activity, self.children, self.pools, self.loop.now())
+
+        self.metrics = metrics.serve(self.config, self.loop, sample, self.backend.name)
 
     def _make_hub(self) -> Hub | None:
         # One hub for each host: a process that Fiber started uses its agent's.
@@ -216,6 +231,8 @@ class Runtime:
         """End every child, agent and thread.  Runs on any thread but the loop's."""
         _logs.debug("ending all processes and agents")
         self.backend.close()
+        if self.metrics is not None:
+            self.metrics.close()
         self.loop.stop()
         if self._monitor is not None:
             self._monitor.close()
@@ -226,6 +243,9 @@ class Runtime:
         if self._monitor is not None:
             with contextlib.suppress(OSError):
                 self._monitor.forget()
+        if self.metrics is not None:
+            with contextlib.suppress(OSError):
+                self.metrics.forget()
 
 
 class SharedArguments:
@@ -301,6 +321,8 @@ _runtime: Runtime | None = None
 _may_link = True
 """True if this process may have agents on other hosts.  Their links need nng, which aborts in a
 forked copy of a process that has used it.  Such a copy runs its processes on its host."""
+_is_copy = False
+"""True in a forked copy of a program.  The program itself serves the metrics."""
 
 
 def runtime() -> Runtime:
@@ -339,10 +361,11 @@ def shutdown() -> None:
 
 def _forget() -> None:
     """Forget the runtime after a fork without Fiber: the loop thread is not in the copy."""
-    global _runtime, _lock, _may_link
+    global _runtime, _lock, _may_link, _is_copy
     if _runtime is not None:
         _runtime.forget()
     _runtime, _lock = None, threading.RLock()
+    _is_copy = True
     _may_link = _may_link and "fiber._transport.nng" not in sys.modules
 
 
