@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from fiber._agent.interface import Backend
     from fiber._backends.shipping import PackedProgram, Shipping
     from fiber._runtime.metrics import MetricsServer
+    from fiber._runtime.records import RecordReader
 
 _WORTH_SHARING = 1 << 16
 """Bytes of a pickle from which on it is sent once for all processes."""
@@ -66,7 +67,10 @@ class Runtime:
         """Server of the program's metrics, if it was asked for."""
         self._can_be_watched = not child.host
         """True until the loop has opened the monitor, or has found that it cannot."""
+        self._records: RecordReader | None = None
+        """Reader of the children's log records, if they were asked for."""
         try:
+            self._records = self._make_records()
             self.hub = self._make_hub()
             self.backend: Backend = _make_backend(self)
             self._shipping = _make_shipping(self.backend)
@@ -80,6 +84,7 @@ class Runtime:
         except BaseException:
             self._close_hub()
             self.loop.stop()
+            self._close_records()
             raise
 
     def _serve_metrics(self) -> None:
@@ -92,6 +97,27 @@ class Runtime:
             return metrics.take_sample(self.activity, self.children, self.pools, self.loop.now())
 
         self.metrics = metrics.serve(self.config, self.loop, sample, self.backend.name)
+
+    def _make_records(self) -> RecordReader | None:
+        if self.config.log_records is None:
+            return None
+        from fiber._runtime import records  # it imports logging
+
+        return records.reader_for(self.config.log_records)
+
+    def _record_calls(self) -> list[Any]:
+        """Return the call that makes a child send its log records, if they were asked for."""
+        if self._records is not None:
+            return list(self._records.calls())
+        if self.config.log_records is None:
+            return []
+        from fiber._runtime import records
+
+        return list(records.passed_on())
+
+    def _close_records(self) -> None:
+        if self._records is not None:
+            self._records.close()
 
     def _make_hub(self) -> Hub | None:
         # One hub for each host: a process that Fiber started uses its agent's.
@@ -192,6 +218,7 @@ class Runtime:
         data["calls"] = [
             (_config_sources.keep, (pickle.dumps(replace(self.config, backend="local")),)),
             (start_methods.inherit, (start_methods.chosen, start_methods.preload)),
+            *self._record_calls(),
         ]
         data["same_host"] = same_host
         if same_host:
@@ -236,6 +263,7 @@ class Runtime:
         self.loop.stop()
         if self._monitor is not None:
             self._monitor.close()
+        self._close_records()
         self._close_hub()
 
     def forget(self) -> None:
@@ -246,6 +274,8 @@ class Runtime:
         if self.metrics is not None:
             with contextlib.suppress(OSError):
                 self.metrics.forget()
+        if self._records is not None:
+            self._records.forget()
 
 
 class SharedArguments:
@@ -313,7 +343,13 @@ def _modules_of(process: Any) -> list[str]:
     ]
 
 
-_OURS = ("fiber.connection", "fiber.queues", "fiber.synchronize", "fiber._agent.worker")
+_OURS = (
+    "fiber.connection",
+    "fiber.queues",
+    "fiber.synchronize",
+    "fiber._agent.records",
+    "fiber._agent.worker",
+)
 
 
 _lock = threading.RLock()  # a finalizer may ask for the runtime while it is made
