@@ -26,6 +26,7 @@ from fiber._hub import client as hub_client
 from fiber._hub.handles import collecting_grants
 from fiber._hub.hub import Hub
 from fiber._monitor.server import MonitorServer
+from fiber._output_files import program_name, usable
 from fiber._runtime import start_methods
 from fiber._runtime.children import Child, ChildOwner, Children
 from fiber._runtime.pool_state import WatchedPool
@@ -51,7 +52,7 @@ class Runtime:
     """State of a program that runs processes: one loop thread and one backend."""
 
     def __init__(self) -> None:
-        self.config = config.current()
+        self.config = _usable(config.current())
         _logs.show(self.config.log_level)
         child.write_whole_lines()
         self.loop = Loop()
@@ -114,6 +115,16 @@ class Runtime:
         from fiber._runtime import records
 
         return list(records.passed_on())
+
+    def _output_calls(self) -> list[Any]:
+        """Return the call that makes a child of this host keep its output, if that is wanted."""
+        folder = self.config.log_to
+        if folder is None or not self.backend.same_host:
+            return []
+        from fiber._agent import output_tee
+
+        passed = output_tee.passed if child.host else (folder, program_name())
+        return [] if passed is None else [(output_tee.install, passed)]
 
     def _close_records(self) -> None:
         if self._records is not None:
@@ -219,6 +230,7 @@ class Runtime:
             (_config_sources.keep, (pickle.dumps(replace(self.config, backend="local")),)),
             (start_methods.inherit, (start_methods.chosen, start_methods.preload)),
             *self._record_calls(),
+            *self._output_calls(),
         ]
         data["same_host"] = same_host
         if same_host:
@@ -316,6 +328,13 @@ def _make_backend(runtime: Runtime) -> Backend:
     return LocalBackend(loop, runtime.host, hub)
 
 
+def _usable(settings: config.Config) -> config.Config:
+    """Return settings without a folder for output that cannot be written to, after a warning."""
+    if settings.log_to is None or child.host:  # children write where the program says
+        return settings
+    return replace(settings, log_to=usable(settings.log_to))
+
+
 def _is_on_cluster(settings: config.Config) -> bool:
     """Tell whether a program that chose no backend runs in a pod that may make others."""
     if settings.backend != "auto" or "KUBERNETES_SERVICE_HOST" not in os.environ:
@@ -347,6 +366,7 @@ _OURS = (
     "fiber.connection",
     "fiber.queues",
     "fiber.synchronize",
+    "fiber._agent.output_tee",
     "fiber._agent.records",
     "fiber._agent.worker",
 )
