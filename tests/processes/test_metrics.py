@@ -18,6 +18,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 import fiber
 from census import wait_until
+from faults.program import Program
 from faults.runtime import BACKENDS, running
 from fiber._runtime import metrics
 from fiber._runtime.metrics import MetricsServer
@@ -133,6 +134,30 @@ def test_the_page_ends_with_the_program(program: Runtime) -> None:
     assert "fiber-metrics" not in {thread.name for thread in threading.enumerate()}
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection((where.hostname, where.port), timeout=PATIENCE)
+
+
+FORKS = """
+    import fiber, os
+    if __name__ == "__main__":
+        fiber.init(metrics_port=0)
+        with fiber.Pool(1) as pool:
+            pool.apply(abs, (-1,))
+        child = os.fork()
+        if child == 0:
+            with fiber.Pool(1) as pool:
+                print(pool.apply(abs, (-2,)), flush=True)
+            os._exit(0)
+        os.waitpid(child, 0)
+"""
+
+
+def test_a_forked_copy_does_not_serve() -> None:
+    program = Program(FORKS)
+    try:
+        assert program.finish() == "2\n"
+        assert program.stderr.count("metrics are at http://127.0.0.1:") == 1
+    finally:
+        program.close()
 
 
 def test_a_taken_port_is_a_warning_and_the_work_goes_on() -> None:

@@ -185,6 +185,19 @@ def test_a_flood_does_not_stop_the_child(backend: str, collector: Collector) -> 
     assert len(numbers) + int(count[1]) + ours.count(end) >= FLOOD
 
 
+def test_a_stuck_handler_does_not_stop_the_end_of_the_program(
+    collector: Collector, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reading, "_AT_EXIT", 0.1)
+    with running(backend="local", log_records="INFO"):
+        collector.open.clear()
+        run(log, "first", "second")
+    (thread,) = (thread for thread in threading.enumerate() if thread.name == "fiber-records")
+    collector.open.set()
+    thread.join(PATIENCE)
+    assert not thread.is_alive()
+
+
 def test_without_the_key_no_record_comes(collector: Collector) -> None:
     with running(backend="local"):
         run(log, "kept")

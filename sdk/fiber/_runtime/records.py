@@ -8,6 +8,7 @@ import logging
 import pickle
 import socket
 import threading
+import time
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -68,9 +69,11 @@ class RecordReader:
         self._closing = True
         if self._grants is not None:
             self._grants.release()
+            deadline = time.monotonic() + _AT_EXIT
             with contextlib.suppress(OSError):
-                self._outbox.post_within(b"", _AT_EXIT)  # it wakes the thread behind all records
-            self._thread.join(_AT_EXIT)
+                # An empty message ends the thread, behind all records.
+                self._outbox.post_within(b"", _AT_EXIT)
+            self._thread.join(max(0.0, deadline - time.monotonic()))
             if self._thread.is_alive():  # a handler is slow or stuck
                 self._inbox.sock.shutdown(socket.SHUT_RDWR)
                 return
