@@ -177,12 +177,14 @@ def test_a_flood_does_not_stop_the_child(backend: str, collector: Collector) -> 
         end = "the program takes records again"
         assert wait_until(lambda: said(pool, end) and end in collector.messages(), PATIENCE)
     ours = [record.msg for record in collector.records if record.name == NAME]
-    (note,) = [record.msg for record in collector.records if record.name == "fiber"]
+    notes = [record.msg for record in collector.records if record.name == "fiber"]
     numbers = [int(message) for message in ours if message != end]
     assert numbers == sorted(numbers)
-    count = re.match(r"(\d+) log records are left out here", note)
-    assert count is not None
-    assert len(numbers) + int(count[1]) + ours.count(end) >= FLOOD
+    # On a busy machine the program may fall behind more than once.
+    counts = [re.match(r"(\d+) log records are left out here", note) for note in notes]
+    left_out = sum(int(count[1]) for count in counts if count is not None)
+    assert left_out > 0
+    assert len(numbers) + left_out + ours.count(end) >= FLOOD
 
 
 def test_a_stuck_handler_does_not_stop_the_end_of_the_program(
