@@ -12,8 +12,11 @@ import queue
 import select
 import sys
 import threading
+from functools import partial
 from multiprocessing import util
 from typing import Any
+
+from fiber._output_files import OutputFile, OutputKeeper
 
 _mp: Any = util  # typeshed does not list its private names
 
@@ -71,10 +74,14 @@ write_around: Any = contextlib.nullcontext
 class OutputWriter:
     """Writer of lines to stderr, on a thread.  A slow, stuck or broken stderr blocks no caller.
 
-    Lines for which there is no room are dropped.  A line in their place says how many.
+    Lines for which there is no room are dropped.  A line in their place says how many.  With
+    ``folder``, each child's lines go to a file there, too.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, folder: str | None = None) -> None:
+        self._keeper = (
+            None if folder is None else OutputKeeper(folder, partial(self.write, "fiber"))
+        )
         self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
         self._thread: threading.Thread | None = None
         self._lock = threading.Lock()
@@ -98,6 +105,16 @@ class OutputWriter:
                 self._say_what_is_left_out()
                 self._put(lines)
 
+    def write_child(
+        self, name: str, host: str, text: str, file: OutputFile | None
+    ) -> OutputFile | None:
+        """Queue lines of a child, as ``write`` does; return its file, to be given the next time."""
+        self.write(f"{name}@{host}", text)
+        if self._keeper is not None:
+            file = file or self._keeper.file(name)
+            self._keeper.write(file, text)
+        return file
+
     def show(self, line: str) -> None:
         """Show ``line`` as the status line of the terminal; return at once.
 
@@ -112,6 +129,8 @@ class OutputWriter:
 
     def close(self) -> None:
         """Write the queued lines, and end the thread."""
+        if self._keeper is not None:
+            self._keeper.close()
         if self._line:
             self.show("")
         with self._lock:

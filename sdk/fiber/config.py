@@ -111,10 +111,11 @@ class Config:
         in `fiber.timeline`. `%p` stands for the process id. If another program has written the file
         since this one began, this one adds its process id to the name. The program's processes
         write none. If it cannot be written, a line on stderr says why.
-    metrics_port*: serve the program's metrics for Prometheus at this port; 0 takes a free one. The
-        address is that of `metrics_host`. None serves none.
-    metrics_host*: the address at which the metrics are served.
-    log_to*: also write the output of each worker to a file of its own in this folder.
+    metrics_port*: serve the program's metrics for Prometheus at this port of `metrics_host`. 0
+        takes a free port, and prints the address. None serves none. It needs prometheus-client.
+    metrics_host*: the address at which the metrics are served. In a pod, a scraper needs "0.0.0.0".
+    log_to*: also write the output of each worker, and of each other process, to a file of its own
+        in this folder. See "Where is my print?" in the documentation.
     log_records*: the least severe level of `logging` records that children send to the program's
         handlers. None sends none.
     runtime_directory*: where Fiber makes its private directory for sockets and credentials.

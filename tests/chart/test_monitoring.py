@@ -6,13 +6,15 @@ import dataclasses
 import functools
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import pytest
+from prometheus_client.core import Metric
 from prometheus_client.parser import text_string_to_metric_families
 
 from chart.helm import CHART, NAMESPACE, Helm, Manifest, kinds, named
+from fiber._runtime import metrics as program
 from fiber_operator.metrics import Metrics, PoolSample
 from fiber_operator.workqueue import Key, QueueStatistics
 
@@ -40,22 +42,45 @@ def exported() -> dict[str, set[str]]:
     metrics.deleted("Released")
     metrics.watched("pods")
     metrics.watch_restarted()
+    return series_of(text_string_to_metric_families(metrics.render().decode()))
+
+
+@functools.cache
+def exported_by_programs() -> dict[str, set[str]]:
+    """Each series that a program exports, with its labels."""
+    sample = program.ProgramSample(
+        dict.fromkeys(program._TOTALS, 1),
+        dict.fromkeys(program._GAUGES, 1),
+        dict.fromkeys(program.STATES, 1),
+        [("work", 1, 1, 1.0)],
+    )
+    return series_of(program.metrics_of(sample, {"backend": "local"}))
+
+
+def series_of(families: Iterable[Metric]) -> dict[str, set[str]]:
     series: dict[str, set[str]] = {}
-    for family in text_string_to_metric_families(metrics.render().decode()):
+    for family in families:
         for sample in family.samples:
             series.setdefault(sample.name, set()).update(sample.labels)
     return series
 
 
-def dashboard() -> dict[str, Any]:
-    text = (CHART / "files" / "dashboard.json").read_text(encoding="utf-8")
+DASHBOARDS = [("dashboard.json", exported), ("program-dashboard.json", exported_by_programs)]
+each_dashboard = pytest.mark.parametrize(
+    ("name", "exporter"), DASHBOARDS, ids=["operator", "program"]
+)
+Exporter = Callable[[], dict[str, set[str]]]
+
+
+def dashboard(name: str) -> dict[str, Any]:
+    text = (CHART / "files" / name).read_text(encoding="utf-8")
     document: dict[str, Any] = json.loads(text)
     return document
 
 
-def queries() -> list[str]:
+def queries(name: str) -> list[str]:
     """Every query of every panel."""
-    panels = [panel for panel in dashboard()["panels"] if panel["type"] != "row"]
+    panels = [panel for panel in dashboard(name)["panels"] if panel["type"] != "row"]
     return [target["expr"] for panel in panels for target in panel["targets"]]
 
 
@@ -77,30 +102,32 @@ def labels(query: str) -> set[str]:
     return {label.strip() for group in grouped for label in group.split(",")} | set(selected)
 
 
-def check(query: str) -> None:
+def check(query: str, series: dict[str, set[str]]) -> None:
     """The series and labels of the query exist."""
-    series = exported()
     found = [name for name, _ in asked(query)]
     assert found, query
     assert set(found) <= series.keys(), query
     assert labels(query) <= set().union(*(series[name] for name in found)) | TARGET_LABELS, query
 
 
-def test_panels_query_exported_metrics() -> None:
-    for query in queries():
-        check(query)
+@each_dashboard
+def test_panels_query_exported_metrics(name: str, exporter: Exporter) -> None:
+    for query in queries(name):
+        check(query, exporter())
 
 
-def test_everything_that_is_exported_has_a_panel() -> None:
-    shown = {name.removesuffix("_bucket") for query in queries() for name, _ in asked(query)}
+@each_dashboard
+def test_everything_that_is_exported_has_a_panel(name: str, exporter: Exporter) -> None:
+    shown = {found.removesuffix("_bucket") for query in queries(name) for found, _ in asked(query)}
     # The client adds to each counter when it began.
-    ours = {name for name in exported() if re.match(r"fiber_(?!.*_created$)", name)}
+    ours = {found for found in exporter() if re.match(r"fiber_(?!.*_created$)", found)}
     suffix = re.compile(r"_(bucket|sum|count)$")
     assert {suffix.sub("", name) for name in ours} - shown == set()
 
 
-def test_panels_are_laid_out_and_numbered() -> None:
-    panels = dashboard()["panels"]
+@each_dashboard
+def test_panels_are_laid_out_and_numbered(name: str, exporter: Exporter) -> None:
+    panels = dashboard(name)["panels"]
     assert len({panel["id"] for panel in panels}) == len(panels)
     cells = [
         (x, y)
@@ -113,15 +140,20 @@ def test_panels_are_laid_out_and_numbered() -> None:
     assert all(panel.get("description") for panel in panels if panel["type"] != "row")
 
 
-def test_the_config_map_holds_the_dashboard(helm: Helm) -> None:
+def test_programs_and_the_operator_share_no_metric() -> None:
+    assert exported().keys().isdisjoint(exported_by_programs())
+
+
+def test_the_config_map_holds_the_dashboards(helm: Helm) -> None:
     config = named(helm.render(ON), "ConfigMap")
     assert config["metadata"]["labels"]["grafana_dashboard"] == "1"
-    assert json.loads(config["data"]["fiber-operator.json"]) == dashboard()
+    assert json.loads(config["data"]["fiber-operator.json"]) == dashboard("dashboard.json")
+    assert json.loads(config["data"]["fiber-program.json"]) == dashboard("program-dashboard.json")
 
 
 def test_alerts_query_exported_metrics(helm: Helm) -> None:
     for rule in alerts(helm.render(ON)).values():
-        check(rule["expr"])
+        check(rule["expr"], exported())
 
 
 def test_alerts_look_where_the_service_monitor_puts_the_metrics(helm: Helm) -> None:

@@ -20,6 +20,7 @@ from contract.test_example_manifests import unknown
 from fakes.strict import unknown_fields
 from fiber._backends.kubernetes.template import PodShape, pod_template
 from fiber._cli.main import _group
+from fiber._cli.run_job import METRICS_PORT
 from fiber.config import Config
 from fiber_api import names
 from fiber_api.rest import POOLS
@@ -56,7 +57,12 @@ def blocks() -> Iterator[Block]:
 
 
 BLOCKS = list(blocks())
-MANIFESTS = [block for block in BLOCKS if "kind" in block.document]
+MONITORS = [block.document for block in BLOCKS if block.document.get("kind") == "PodMonitor"]
+MANIFESTS = [
+    block
+    for block in BLOCKS
+    if "kind" in block.document and block.document not in MONITORS  # not a kind of Kubernetes
+]
 TEMPLATES = [block for block in BLOCKS if "kind" not in block.document]
 
 
@@ -128,6 +134,14 @@ def test_the_account_of_programs_has_the_role() -> None:
     )
     assert account["metadata"]["name"] == subject["name"] == names.PROGRAM_ACCOUNT
     assert account["metadata"]["namespace"] == subject["namespace"]
+
+
+def test_the_monitor_of_programs_finds_the_port_of_fiber_run() -> None:
+    (monitor,) = MONITORS
+    (selected,) = monitor["spec"]["selector"]["matchExpressions"]
+    assert selected == {"key": names.LABEL_PROGRAM, "operator": "Exists"}
+    (endpoint,) = monitor["spec"]["podMetricsEndpoints"]
+    assert endpoint == {"port": METRICS_PORT}
 
 
 def test_the_quota_counts_fiber_pools() -> None:

@@ -209,6 +209,27 @@ def test_the_log_of_a_program_is_the_file_that_it_writes_to(
     assert "--since is for programs in pods" in outcome.err
 
 
+def test_the_log_of_a_worker_is_its_file(start: Callable[..., Program], tmp_path: Path) -> None:
+    program = start(env={"FIBER_LOG_TO": str(tmp_path / "logs")})
+    name = name_of(program)
+    assert program.line() == "begun"
+    path = tmp_path / "logs" / f"{name}.Simulator.log"
+    path.write_text("an earlier one\n")
+    os.utime(path, (1, 1))
+    path.with_suffix(".2.log").write_text("step 1\n")
+    command = [sys.executable, "-m", "fiber._cli.main", "logs", name, "--worker", "Simulator"]
+    assert subprocess.check_output(command) == b"step 1\n"
+    outcome = run("logs", name, "--worker", "Simulater")
+    assert outcome.status == 3
+    assert "choose one of Simulator" in outcome.err
+
+
+def test_without_files_the_workers_of_a_program_share_its_log(program: Program) -> None:
+    outcome = run("logs", name_of(program), "--worker", "Simulator")
+    assert outcome.status == 2
+    assert 'fiber.init(log_to="logs")' in outcome.err
+
+
 def test_a_program_whose_output_is_no_file_has_no_log(program: Program) -> None:
     outcome = run("logs", name_of(program))
     assert outcome.status == 1

@@ -141,6 +141,13 @@ def test_the_job_asks_for_what_the_options_name(site: Site) -> None:
     assert site.server.objects("serviceaccounts") == []
 
 
+def test_the_port_of_metrics_has_a_name_by_which_a_scraper_finds_it(site: Site) -> None:
+    site.write("train.py", "")
+    port = ("--env", "FIBER_METRICS_PORT=9100", "--env", "FIBER_METRICS_HOST=0.0.0.0")
+    assert site.fiber("run", *port, "train.py") == Outcome(0, "", "")
+    assert {"name": "metrics", "containerPort": 9100} in site.container()["ports"]
+
+
 def test_a_configured_template_keeps_its_variables_and_containers(site: Site) -> None:
     worker = {
         "name": "worker",

@@ -21,6 +21,7 @@ from fiber._agent.interface import OUT_OF_MEMORY, Cause, ChildObserver, ChildSpe
 from fiber._agent.usage import Usage
 from fiber._hub.hub import Hub
 from fiber._logs import OutputWriter
+from fiber._output_files import OutputFile
 from fiber._transport.link import Link
 from fiber._transport.link_protocol import Frame
 from fiber._transport.loop import EventLoop
@@ -240,6 +241,8 @@ class RemoteChild:
         """Host of the child; empty while it waits for an agent."""
         self.pid: int | None = None
         self.start_error: Exception | None = None
+        self._file: OutputFile | None = None
+        """File with the child's output, if it is kept and there was any."""
         self.observer = observer
         self._starter = starter
         self._loop = starter.loop
@@ -383,7 +386,7 @@ class RemoteChild:
         elif isinstance(message, messages.Measured):
             self.observer.measured(Usage(message.memory, message.milliseconds / 1000))
         elif isinstance(message, messages.ChildOutput):
-            output.write(f"{self.name}@{self.host}", message.text)
+            self._file = output.write_child(self.name, self.host, message.text, self._file)
         elif isinstance(message, messages.Exited) and self._may_begin_elsewhere(message):
             self._agent, self.host, self._unasked = None, "", []
             self._start, self._asked = self._asked, None

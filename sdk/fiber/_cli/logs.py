@@ -30,7 +30,7 @@ _WHY_EMPTY = {
 
 @click.command("logs")
 @click.argument("name")
-@click.option("--worker", metavar="POD", help="Worker instead of the program: its pod.")
+@click.option("--worker", metavar="WORKER", help="Worker instead of the program: pod or name.")
 @click.option("-f", "--follow", is_flag=True, help="Go on until the end.")
 @click.option("--since", metavar="TIME", help="Only newer output: 30s, 5m, 2h or 1d.")
 @cluster_options
@@ -45,7 +45,7 @@ def command(
     """Show the output of a program that `fiber run` started, or of a worker.
 
     A program in a pod that has ended keeps its log for an hour.  A program of this machine has a
-    log if its output goes to a file.
+    log if its output goes to a file, and its workers have logs if it sets `log_to`.
 
     \b
     Examples:

@@ -29,6 +29,9 @@ _FILES_WITHIN = 600
 _KEPT = 3600
 """Seconds that a program that has ended is kept, with its log."""
 
+METRICS_PORT = "metrics"
+"""Name of the port at which a program serves its metrics."""
+
 _GROUP = 65532
 """Group of the user of Fiber's images."""
 
@@ -141,6 +144,9 @@ def _make_launcher(container: Body, source: Source, options: dict[str, Any]) -> 
         # The kubelet replaces $(NAME) by a variable, and $$ by $.
         variables[name] = {"name": name, "value": value.replace("$", "$$")}
     container["env"] = list(variables.values())
+    if (port := wanted.get("FIBER_METRICS_PORT", "")).isdecimal() and int(port):
+        metrics = {"name": METRICS_PORT, "containerPort": int(port)}
+        container["ports"] = [*(container.get("ports") or ()), metrics]
     added = [{"secretRef": {"name": name}} for name in options["secret"]]
     if added:
         container["envFrom"] = [*(container.get("envFrom") or ()), *added]

@@ -198,6 +198,8 @@ class Activity:
         """Runs that were repeated, since the task raised an error after which it is tried again."""
         self.lost = 0
         """Runs that were lost with their workers."""
+        self.died = 0
+        """Children that ended, and that the program had not asked to end."""
         self.forgotten = 0
         """Children whose records were dropped."""
         self.deaths: deque[ChildRecord] = deque(maxlen=DEATHS)
@@ -245,6 +247,7 @@ class Activity:
         record.ended, record.reason = now, reason
         record.changed = self._revision
         if reason:
+            self.died += 1
             self.deaths.append(record)
         self._ended.append(record)
         if len(self._ended) > ENDED:

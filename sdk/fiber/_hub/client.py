@@ -235,6 +235,10 @@ class HubStream:
         number, self._begun = self._begun, None  # after Ctrl-C the reply is not read again
         return None if number is None else self._reply(number, None)
 
+    def finishes_within(self, seconds: float) -> bool:
+        """Return whether ``finish`` need not wait, ``seconds`` from now at the latest."""
+        return self._begun is None or wait_readable(self._sock.fileno(), seconds)
+
     def give_up(self) -> None:
         """Give up the reply to the last request.
 

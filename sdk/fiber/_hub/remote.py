@@ -189,6 +189,20 @@ class RemoteChannel(RemoteObject):
             _check_sent(stream.finish())
             stream.begin(Op.SEND, [memoryview(payload), *buffers])
 
+    def post_within(self, payload: BytesLike, seconds: float) -> bool:
+        """Send one message, if the message before arrives within ``seconds``."""
+        with _naming_the_end(), self._take(self._unconfirmed) as stream:
+            if not stream.finishes_within(seconds):
+                return False
+            _check_sent(stream.finish())
+            stream.begin(Op.SEND, [memoryview(payload)])
+            return True
+
+    def sent_within(self, seconds: float) -> bool:
+        """Return whether the last message of ``post_within`` arrives within ``seconds``."""
+        with _naming_the_end(), self._take(self._unconfirmed) as stream:
+            return stream.finishes_within(seconds)
+
     def _confirm(self) -> None:
         with _naming_the_end(), self._take(self._unconfirmed) as stream:
             _check_sent(stream.finish())

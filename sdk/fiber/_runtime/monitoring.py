@@ -17,7 +17,6 @@ from __future__ import annotations
 import contextlib
 import os
 import queue
-import re
 import sys
 import threading
 import time
@@ -28,6 +27,7 @@ from types import FrameType
 from typing import Any, TypeVar, cast
 
 from fiber._engine.activity import Activity, ChildRecord
+from fiber._output_files import program_name
 from fiber._runtime.activity_reading import on_loop, snapshot
 from fiber._runtime.children import Child, Children
 from fiber._runtime.pool_state import WatchedPool
@@ -84,6 +84,7 @@ class Monitor:
             **program_facts(),
             "backend": self._backend,
             "namespace": self._config.namespace,
+            "log_to": self._config.log_to,
             "children": len(self._children),
         }
 
@@ -180,7 +181,7 @@ def _facts(child: Child) -> dict[str, Any]:
 def program_facts() -> dict[str, Any]:
     """Return the facts of this process."""
     return {
-        "name": f"{_stem()}-{os.getpid()}",
+        "name": program_name(),
         "pid": os.getpid(),
         "started": _start_time(),
         "command": _command(),
@@ -188,16 +189,6 @@ def program_facts() -> dict[str, Any]:
         "python": sys.version.split()[0],
         "fiber": cast("Any", sys.modules["fiber"]).__version__,
     }
-
-
-def _stem() -> str:
-    """Return the name of the program's script or module, as a part of a name."""
-    main = sys.modules.get("__main__")
-    spec = getattr(main, "__spec__", None)
-    path = getattr(main, "__file__", None)
-    name = spec.name.removesuffix(".__main__") if spec else os.path.basename(path or "python")
-    stem = re.sub("[^a-z0-9]+", "-", name.removesuffix(".py").lower()).strip("-")
-    return stem[:40] or "python"
 
 
 def _directory() -> str:

@@ -26,6 +26,7 @@ from fiber._hub import client as hub_client
 from fiber._hub.handles import collecting_grants
 from fiber._hub.hub import Hub
 from fiber._monitor.server import MonitorServer
+from fiber._output_files import program_name, usable
 from fiber._runtime import start_methods
 from fiber._runtime.children import Child, ChildOwner, Children
 from fiber._runtime.pool_state import WatchedPool
@@ -38,6 +39,8 @@ from fiber.resources import resources_of
 if TYPE_CHECKING:
     from fiber._agent.interface import Backend
     from fiber._backends.shipping import PackedProgram, Shipping
+    from fiber._runtime.metrics import MetricsServer
+    from fiber._runtime.records import RecordReader
     from fiber._runtime.timeline import TimelineAtEnd
 
 _WORTH_SHARING = 1 << 16
@@ -50,7 +53,7 @@ class Runtime:
     """State of a program that runs processes: one loop thread and one backend."""
 
     def __init__(self) -> None:
-        self.config = config.current()
+        self.config = _usable(config.current())
         _logs.show(self.config.log_level)
         child.write_whole_lines()
         self.loop = Loop()
@@ -64,9 +67,14 @@ class Runtime:
         self.timeline: TimelineAtEnd | None = None
         """Timeline that is written at the end of the program."""
         self._monitor: MonitorServer | None = None
+        self.metrics: MetricsServer | None = None
+        """Server of the program's metrics, if it was asked for."""
         self._can_be_watched = not child.host
         """True until the loop has opened the monitor, or has found that it cannot."""
+        self._records: RecordReader | None = None
+        """Reader of the children's log records, if they were asked for."""
         try:
+            self._records = self._make_records()
             self.hub = self._make_hub()
             self.backend: Backend = _make_backend(self)
             self._shipping = _make_shipping(self.backend)
@@ -75,11 +83,55 @@ class Runtime:
                 and not (self._shipping is not None and self._shipping.main_is_sent)
             )
             self.loop.start_thread("fiber-io")
+            self._serve_metrics()
             _logs.debug("%s on host %s", type(self.backend).__name__, self.host)
         except BaseException:
             self._close_hub()
             self.loop.stop()
+            self._close_records()
             raise
+
+    def _serve_metrics(self) -> None:
+        """Serve the metrics, unless this process is a child or a forked copy of a program."""
+        if self.config.metrics_port is None or child.host or _is_copy:
+            return
+        from fiber._runtime import metrics  # rarely needed
+
+        def sample() -> metrics.ProgramSample:
+            return metrics.take_sample(self.activity, self.children, self.pools, self.loop.now())
+
+        self.metrics = metrics.serve(self.config, self.loop, sample, self.backend.name)
+
+    def _make_records(self) -> RecordReader | None:
+        if self.config.log_records is None:
+            return None
+        from fiber._runtime import records  # it imports logging
+
+        return records.reader_for(self.config.log_records)
+
+    def _record_calls(self) -> list[Any]:
+        """Return the call that makes a child send its log records, if they were asked for."""
+        if self._records is not None:
+            return list(self._records.calls())
+        if self.config.log_records is None:
+            return []
+        from fiber._runtime import records
+
+        return list(records.passed_on())
+
+    def _output_calls(self) -> list[Any]:
+        """Return the call that makes a child of this host keep its output, if that is wanted."""
+        folder = self.config.log_to
+        if folder is None or not self.backend.same_host:
+            return []
+        from fiber._agent import output_tee
+
+        passed = output_tee.passed if child.host else (folder, program_name())
+        return [] if passed is None else [(output_tee.install, passed)]
+
+    def _close_records(self) -> None:
+        if self._records is not None:
+            self._records.close()
 
     def _make_hub(self) -> Hub | None:
         # One hub for each host: a process that Fiber started uses its agent's.
@@ -180,6 +232,8 @@ class Runtime:
         data["calls"] = [
             (_config_sources.keep, (pickle.dumps(replace(self.config, backend="local")),)),
             (start_methods.inherit, (start_methods.chosen, start_methods.preload)),
+            *self._record_calls(),
+            *self._output_calls(),
         ]
         data["same_host"] = same_host
         if same_host:
@@ -233,9 +287,12 @@ class Runtime:
         """End every child, agent and thread.  Runs on any thread but the loop's."""
         _logs.debug("ending all processes and agents")
         self.backend.close()
+        if self.metrics is not None:
+            self.metrics.close()
         self.loop.stop()
         if self._monitor is not None:
             self._monitor.close()
+        self._close_records()
         self._close_hub()
 
     def forget(self) -> None:
@@ -243,6 +300,11 @@ class Runtime:
         if self._monitor is not None:
             with contextlib.suppress(OSError):
                 self._monitor.forget()
+        if self.metrics is not None:
+            with contextlib.suppress(OSError):
+                self.metrics.forget()
+        if self._records is not None:
+            self._records.forget()
 
 
 class SharedArguments:
@@ -291,6 +353,13 @@ def _make_timeline(path: str | None) -> TimelineAtEnd | None:
     return timeline_at_end(path)
 
 
+def _usable(settings: config.Config) -> config.Config:
+    """Return settings without a folder for output that cannot be written to, after a warning."""
+    if settings.log_to is None or child.host:  # children write where the program says
+        return settings
+    return replace(settings, log_to=usable(settings.log_to))
+
+
 def _is_on_cluster(settings: config.Config) -> bool:
     """Tell whether a program that chose no backend runs in a pod that may make others."""
     if settings.backend != "auto" or "KUBERNETES_SERVICE_HOST" not in os.environ:
@@ -318,7 +387,14 @@ def _modules_of(process: Any) -> list[str]:
     ]
 
 
-_OURS = ("fiber.connection", "fiber.queues", "fiber.synchronize", "fiber._agent.worker")
+_OURS = (
+    "fiber.connection",
+    "fiber.queues",
+    "fiber.synchronize",
+    "fiber._agent.output_tee",
+    "fiber._agent.records",
+    "fiber._agent.worker",
+)
 
 
 _lock = threading.RLock()  # a finalizer may ask for the runtime while it is made
@@ -326,6 +402,8 @@ _runtime: Runtime | None = None
 _may_link = True
 """True if this process may have agents on other hosts.  Their links need nng, which aborts in a
 forked copy of a process that has used it.  Such a copy runs its processes on its host."""
+_is_copy = False
+"""True in a forked copy of a program.  The program itself serves the metrics."""
 
 
 def runtime() -> Runtime:
@@ -375,10 +453,11 @@ def read_activity() -> dict[str, Any]:
 
 def _forget() -> None:
     """Forget the runtime after a fork without Fiber: the loop thread is not in the copy."""
-    global _runtime, _lock, _may_link
+    global _runtime, _lock, _may_link, _is_copy
     if _runtime is not None:
         _runtime.forget()
     _runtime, _lock = None, threading.RLock()
+    _is_copy = True
     _may_link = _may_link and "fiber._transport.nng" not in sys.modules
 
 
