@@ -49,7 +49,7 @@ class MonitorServer:
         self._loop = loop
         self._answer = answer
         self._clients: set[socket.socket] = set()
-        self._path = os.path.join(directory, SOCKET)
+        self.path = os.path.join(directory, SOCKET)
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
         try:
             self._listen(os.path.join(directory, _UNFINISHED))
@@ -62,13 +62,13 @@ class MonitorServer:
         # A socket that does not listen yet would look like that of a killed program.
         self._listener.bind(unfinished)
         self._listener.listen(_BACKLOG)
-        os.rename(unfinished, self._path)
+        os.rename(unfinished, self.path)
 
     def close(self) -> None:
         """Refuse clients, and end the answers.  Runs after the end of the loop."""
         self._listener.close()
         with contextlib.suppress(OSError):
-            os.unlink(self._path)
+            os.unlink(self.path)
         for client in list(self._clients):
             with contextlib.suppress(OSError):
                 client.shutdown(socket.SHUT_RDWR)

@@ -38,6 +38,7 @@ from fiber.resources import resources_of
 if TYPE_CHECKING:
     from fiber._agent.interface import Backend
     from fiber._backends.shipping import PackedProgram, Shipping
+    from fiber._runtime.dashboard import DashboardProcess
 
 _WORTH_SHARING = 1 << 16
 """Bytes of a pickle from which on it is sent once for all processes."""
@@ -61,6 +62,7 @@ class Runtime:
         self.pools: weakref.WeakSet[WatchedPool] = weakref.WeakSet()
         """Executors with workers.  Only the loop thread adds and removes them."""
         self._monitor: MonitorServer | None = None
+        self._dashboard: DashboardProcess | None = None
         self._can_be_watched = not child.host
         """True until the loop has opened the monitor, or has found that it cannot."""
         try:
@@ -150,15 +152,28 @@ class Runtime:
             address = self.hub.address_or_problem if self._cleans_up() else self.hub.known_address
             if address is not None and (directory := os.path.dirname(address.path)):
                 self._monitor = MonitorServer(self.loop, directory, self._answer_monitor)
+            if self.config.dashboard:
+                self._open_dashboard()
         except (OSError, FiberError) as error:
             _logs.debug("this program cannot be watched: %s", error)
+            if self.config.dashboard:
+                _warn_of_no_dashboard(error)
+
+    def _open_dashboard(self) -> None:
+        from fiber._runtime.dashboard import DashboardProcess  # rarely needed
+        from fiber._runtime.monitoring import program_facts
+
+        if self._monitor is None:
+            raise FiberError("this process has no directory for its socket")
+        self._dashboard = DashboardProcess(self._monitor.path, program_facts()["name"])
 
     def _cleans_up(self) -> bool:
         """Return whether the hub's directory goes when this program is killed.
 
-        Zygotes and agents of this host remove it, or it goes with the pod of the program.
+        Zygotes and agents of this host remove it, or the process of the dashboard, or it goes with
+        the pod of the program.
         """
-        return not self.elastic or "KUBERNETES_SERVICE_HOST" in os.environ
+        return not self.elastic or self.config.dashboard or "KUBERNETES_SERVICE_HOST" in os.environ
 
     def _answer_monitor(self, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
         from fiber._runtime.monitoring import Monitor  # rarely needed
@@ -215,6 +230,8 @@ class Runtime:
     def close(self) -> None:
         """End every child, agent and thread.  Runs on any thread but the loop's."""
         _logs.debug("ending all processes and agents")
+        if self._dashboard is not None:
+            self._dashboard.close()
         self.backend.close()
         self.loop.stop()
         if self._monitor is not None:
@@ -223,6 +240,8 @@ class Runtime:
 
     def forget(self) -> None:
         """Close what a forked copy of this process must not hold."""
+        if self._dashboard is not None:
+            self._dashboard.forget()
         if self._monitor is not None:
             with contextlib.suppress(OSError):
                 self._monitor.forget()
@@ -247,6 +266,12 @@ class SharedArguments:
                 self._blob = Blob(data)
             self._tried = True
         return self._blob
+
+
+def _warn_of_no_dashboard(error: Exception) -> None:
+    if sys.stderr is not None:
+        with contextlib.suppress(OSError, ValueError):
+            print(f"fiber: this program has no dashboard: {error}", file=sys.stderr)
 
 
 def _make_backend(runtime: Runtime) -> Backend:
