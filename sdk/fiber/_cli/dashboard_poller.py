@@ -124,7 +124,7 @@ class Poller:
     def _answers(self, ask: Ask) -> News:
         activity = self._activity(ask)
         if not activity["complete"] and not same_start(activity["start"], self._start):
-            self._since = 0  # the record is another one
+            self._since = 0
             activity = self._activity(ask)
         self._since, self._start = activity["revision"], activity["start"]
         program, lines = self._chosen(ask({"ask": "state"}))
@@ -162,5 +162,5 @@ class Poller:
             raise client.ProgramGone("the program has ended")
         if self._pid not in processes:
             self._pid = max(processes, key=lambda pid: int(processes[pid][0]["children"]))
-            self._since = 0
+            self._start = 0.0  # its record is another one
         return processes[self._pid]
