@@ -19,7 +19,10 @@ from faults.program import Program, wait_for
 from fiber._monitor import client
 from patience import PATIENCE
 
-pytestmark = pytest.mark.skipif(browsers.chromium() is None, reason=browsers.MISSING)
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(browsers.chromium() is None, reason=browsers.MISSING),
+]
 
 _SCRIPT = """
 import os, signal, sys, threading, fiber
@@ -33,7 +36,7 @@ def rest(number):
     threading.Event().wait()
 
 if __name__ == "__main__":
-    fiber.init(dashboard=True)
+    fiber.init(dashboard=True, retries=0)
     with fiber.Pool(3) as pool:
         print(os.getpid(), flush=True)
         for line in sys.stdin:
@@ -41,7 +44,7 @@ if __name__ == "__main__":
             if word == "work":
                 pool.map_async(work, range(int(argument)), chunksize=1).wait()
             elif word == "rest":
-                pool.apply_async(rest, (1,), retries=0)
+                pool.apply_async(rest, (1,))
             elif word == "kill":
                 busy = [worker for worker in pool.workers() if worker.state == "busy"]
                 os.kill(busy[0].pid, signal.SIGKILL)

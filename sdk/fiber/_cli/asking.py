@@ -35,16 +35,25 @@ def answer_of(
         ) from error
 
 
-def find_program(name: str, context: str | None, namespace: str | None) -> Ask:
-    """Return the function that asks a program again and again; CommandError if it is not there."""
-    return _ask_of(name, find_local(name, context, namespace), context, namespace)
+def find_program(
+    name: str, context: str | None, namespace: str | None, patience: float = client.PATIENCE
+) -> Ask:
+    """Return the function that asks a program again and again; CommandError if it is not there.
+
+    ``patience``: seconds that a program of this machine may take for a part of its answer.
+    """
+    return _ask_of(name, find_local(name, context, namespace), context, namespace, patience)
 
 
 def _ask_of(
-    name: str, program: LocalProgram | None, context: str | None, namespace: str | None
+    name: str,
+    program: LocalProgram | None,
+    context: str | None,
+    namespace: str | None,
+    patience: float = client.PATIENCE,
 ) -> Ask:
     if program is not None:
-        return partial(client.ask, program.socket)
+        return partial(client.ask, program.socket, patience=patience)
     return partial(_answer_of_pod, connect(context, namespace), name)
 
 

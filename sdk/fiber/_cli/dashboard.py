@@ -19,7 +19,7 @@ import click
 
 from fiber._cli import local_logs
 from fiber._cli.asking import Ask, find_program
-from fiber._cli.dashboard_poller import News, Poller
+from fiber._cli.dashboard_poller import PATIENCE, News, Poller
 from fiber._cli.failures import USAGE, CommandError
 from fiber._cli.local import find_local, only_program
 from fiber._cli.session import cluster_options
@@ -83,7 +83,8 @@ def command(
     name = name or only_program()
     _check_that_it_runs(name, context, namespace)
     output = partial(_output, name, context, namespace)
-    asyncio.run(_serve(name, partial(find_program, name, context, namespace), port, output, opens))
+    find = partial(find_program, name, context, namespace, PATIENCE)
+    asyncio.run(_serve(name, find, port, output, opens))
 
 
 def _need_aiohttp() -> None:
@@ -114,7 +115,7 @@ def _serve_own_program(port: int) -> None:
     if not line:  # the program has ended already
         return
     facts = json.loads(line)
-    ask: Ask = partial(client.ask, facts["monitor"])
+    ask: Ask = partial(client.ask, facts["monitor"], patience=PATIENCE)
     asyncio.run(_serve_until_the_end(facts["name"], lambda: ask, port))
 
 

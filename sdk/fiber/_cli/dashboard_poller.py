@@ -12,6 +12,9 @@ from fiber._cli.dashboard_model import same_start
 from fiber._cli.failures import NOT_FOUND, CommandError
 from fiber._monitor import client
 
+PATIENCE = 4.0
+"""Seconds that a program of this machine may take for a part of its answer."""
+
 _INTERVAL = 0.5
 """Seconds between two answers while a page is open."""
 
@@ -89,10 +92,12 @@ class Poller:
             took = time.monotonic() - began
             self._has_ended = news.has_ended
             self._publish(news)
-            if self._pages:
-                pause = max(_INTERVAL, _ANSWER_SHARE * took)
-            else:
-                pause = max(_QUIET_INTERVAL, _QUIET_ANSWER_SHARE * took)
+            pause = self._pause(0.0 if news.problem else took)
+
+    def _pause(self, took: float) -> float:
+        if self._pages:
+            return max(_INTERVAL, _ANSWER_SHARE * took)
+        return max(_QUIET_INTERVAL, _QUIET_ANSWER_SHARE * took)
 
     def _wait(self, pause: float) -> None:
         """Wait until the program is to be asked."""
