@@ -15,10 +15,11 @@ import sys
 from pathlib import Path
 from typing import Literal
 
-import browser as browsers
-from docsite import ROOT
 from PIL import Image
 from playwright.sync_api import Page
+
+import browser as browsers
+from docsite import ROOT
 
 _PROGRAM = Path(__file__).with_name("dashboard_program.py")
 _ADDRESS = re.compile(r"http://127\.0\.0\.1:\d+/\?token=\S+")

@@ -143,6 +143,7 @@ def test_without_aiohttp_the_program_works_and_warns_once(
     go_on(program)
     program.finish()
     assert program.stderr.count("fiber: ") == 1
+    assert program.stderr.count("\n") == 3
     assert "Traceback" not in program.stderr
 
 

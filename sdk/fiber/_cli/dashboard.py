@@ -147,7 +147,7 @@ async def _serve_until_the_end(name: str, find: Callable[[], Ask], port: int) ->
             looked.set()
 
     server, poller = await _started(find, port, _own_output, always=True, seen=saw)
-    click.echo(f"fiber: the dashboard of {name} is at {server.url}", err=True)
+    click.echo(f"the dashboard of {name} is at {server.url}")
     loop.add_reader(0, _read_on, ending)
     await ending.wait()
     loop.remove_reader(0)

@@ -21,7 +21,7 @@ _INTERVAL = 0.5
 _QUIET_INTERVAL = 1.0
 """Seconds between two answers while no page is open, if the program has asked for its page."""
 
-_ANSWER_SHARE = 4
+_ANSWER_SHARE = 3
 _QUIET_ANSWER_SHARE = 30
 """Pauses are so many times as long as an answer takes, so that a program with much to say works."""
 

@@ -38,7 +38,10 @@ _LONGEST = 1 << 16
 _PATIENCE = 10.0
 """Seconds that a client may take to send its request, and to take a part of the answer."""
 
-Answer = Callable[[dict[str, Any]], Iterable[dict[str, Any]]]
+Lines = dict[str, Any] | list[dict[str, Any]]
+"""A line of an answer, or lines that are sent together."""
+
+Answer = Callable[[dict[str, Any]], Iterable[Lines]]
 
 
 class MonitorServer:
@@ -110,12 +113,12 @@ class MonitorServer:
         try:
             client.settimeout(_PATIENCE)
             with client, contextlib.suppress(OSError):
-                for line in self._lines(client):
-                    client.sendall(json.dumps(line).encode() + b"\n")
+                for lines in self._lines(client):
+                    client.sendall(_encoded(lines))
         finally:
             self._clients.discard(client)
 
-    def _lines(self, client: socket.socket) -> Iterable[dict[str, Any]]:
+    def _lines(self, client: socket.socket) -> Iterable[Lines]:
         try:
             with client.makefile("rb") as stream:
                 request = json.loads(stream.readline(_LONGEST))
@@ -124,3 +127,9 @@ class MonitorServer:
             raise
         except Exception as error:  # the client shows it
             yield {"error": f"{type(error).__name__}: {error}"}
+
+
+def _encoded(lines: Lines) -> bytes:
+    # Each call of the system lets a busy thread take Python's lock, so many lines need one call.
+    listed = lines if isinstance(lines, list) else [lines]
+    return b"".join(json.dumps(line).encode() + b"\n" for line in listed)

@@ -26,6 +26,7 @@ from types import FrameType
 from typing import Any, TypeVar, cast
 
 from fiber._engine.activity import Activity, ChildRecord
+from fiber._monitor.server import Lines
 from fiber._runtime.children import Child, Children
 from fiber._runtime.pool_state import WatchedPool
 from fiber._transport.loop import Loop
@@ -62,12 +63,12 @@ class Monitor:
         self._backend = backend
         self._config = config
 
-    def answer(self, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    def answer(self, request: dict[str, Any]) -> Iterator[Lines]:
         """Yield the lines of the answer."""
         yield {"program": self._program()}
         ask = request.get("ask")
         if ask == "state":
-            yield from self._on_loop(self._state)
+            yield self._on_loop(self._state)
         elif ask == "activity":
             yield {"activity": self._on_loop(partial(self._snapshot, request.get("since", 0)))}
         elif ask == "stacks":

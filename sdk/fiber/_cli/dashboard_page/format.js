@@ -31,7 +31,7 @@ export function seconds(value) {
 
 // The mark of an axis of time: as short as it can be.
 export function mark(value, step) {
-  if (value < 120) return `${Number(value.toFixed(step < 1 ? 3 : 0))} s`;
+  if (value < 120) return `${Number(value.toFixed(Number.isInteger(step) ? 0 : 3))} s`;
   const minutes = Math.floor(value / 60);
   const rest = Math.round(value % 60);
   if (value < 7200) return rest ? `${minutes}:${String(rest).padStart(2, "0")} min` : `${minutes} min`;
