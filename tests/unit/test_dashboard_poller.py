@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import queue
+import threading
 from collections.abc import Iterator
 from typing import Any
 
@@ -10,6 +12,7 @@ from fiber._cli.dashboard_poller import News, Poller
 from fiber._cli.failures import NO_ANSWER, NOT_FOUND, CommandError
 from fiber._engine.activity import Activity, WorkReport
 from fiber._monitor import client
+from patience import PATIENCE
 
 Facts = dict[str, Any]
 
@@ -132,3 +135,35 @@ def test_an_error_in_the_answer_is_shown() -> None:
     news = poller_of(ask).look()
     assert "has no answer to 'activity'" in news.problem
     assert not news.has_ended
+
+
+def test_the_last_look_begins_after_the_end_was_asked_for() -> None:
+    """A look that is under way may not know what the program did last."""
+    program = ScriptedProgram()
+    asked, goes_on = threading.Event(), threading.Event()
+    seen: list[News] = []
+
+    def ask(request: Facts) -> Iterator[Facts]:
+        asked.set()
+        assert goes_on.wait(PATIENCE)
+        yield from program.ask(request)
+
+    poller = Poller(lambda: ask, seen.append, always=True)
+    poller.start()
+    assert asked.wait(PATIENCE)
+    poller.end(0.0)
+    goes_on.set()
+    poller.end(PATIENCE)
+    assert len(seen) == 2
+
+
+def test_a_program_is_asked_only_while_a_page_is_open() -> None:
+    program = ScriptedProgram()
+    came: queue.SimpleQueue[News] = queue.SimpleQueue()
+    poller = Poller(lambda: program.ask, came.put, always=False)
+    poller.start()
+    poller.opened()
+    assert came.get(timeout=PATIENCE).program is not None
+    came.get(timeout=PATIENCE)
+    poller.closed()
+    poller.end(PATIENCE)

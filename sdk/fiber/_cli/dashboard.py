@@ -140,20 +140,13 @@ async def _serve(
 
 async def _serve_until_the_end(name: str, find: Callable[[], Ask], port: int) -> None:
     loop = asyncio.get_running_loop()
-    looked, ending = asyncio.Event(), asyncio.Event()
-
-    def saw(news: News) -> None:
-        if ending.is_set():
-            looked.set()
-
-    server, poller = await _started(find, port, _own_output, always=True, seen=saw)
+    ending = asyncio.Event()
+    server, poller = await _started(find, port, _own_output, always=True)
     click.echo(f"the dashboard of {name} is at {server.url}")
     loop.add_reader(0, _read_on, ending)
     await ending.wait()
     loop.remove_reader(0)
-    poller.look_now()
-    with contextlib.suppress(TimeoutError):
-        await asyncio.wait_for(looked.wait(), _LAST_LOOK)
+    await asyncio.to_thread(poller.end, _LAST_LOOK)
     server.set_status("ended", "")
     await server.close()
 
@@ -169,7 +162,7 @@ async def _started(
     output: Callable[[dict[str, Any]], dict[str, Any]],
     *,
     always: bool,
-    seen: Callable[[News], None],
+    seen: Callable[[News], None] | None = None,
 ) -> tuple[PageServer, Poller]:
     """Start a server and the poller that it publishes; ``seen`` gets the news after it."""
     from fiber._cli.dashboard_server import PageServer, listen  # it needs aiohttp
@@ -178,7 +171,8 @@ async def _started(
 
     def publish(news: News) -> None:
         server.publish(news)
-        seen(news)
+        if seen is not None:
+            seen(news)
 
     def pass_on(news: News) -> None:
         with contextlib.suppress(RuntimeError):  # the loop has ended, and this thread ends with it

@@ -56,9 +56,9 @@ class Poller:
         self._start = 0.0
         self._pages = 0
         self._changed = threading.Condition()
-        self._looks = 0
-        """Looks that were asked for at once, and not yet begun."""
-        self._has_ended = False
+        self._is_due = False
+        """True if a page waits for an answer."""
+        self._has_ended = self._is_ending = False
         self._thread = threading.Thread(target=self._run, name="fiber-dashboard", daemon=True)
 
     def start(self) -> None:
@@ -69,7 +69,7 @@ class Poller:
         """Note that a page is open: look at once."""
         with self._changed:
             self._pages += 1
-            self._looks += 1
+            self._is_due = True
             self._changed.notify()
 
     def closed(self) -> None:
@@ -77,16 +77,18 @@ class Poller:
         with self._changed:
             self._pages -= 1
 
-    def look_now(self) -> None:
-        """Look once more, at once."""
+    def end(self, seconds: float) -> None:
+        """Look for the last time, now, and end; wait so many seconds for that."""
         with self._changed:
-            self._looks += 1
+            self._is_ending = True
             self._changed.notify()
+        self._thread.join(seconds)
 
     def _run(self) -> None:
-        pause = 0.0
-        while True:
+        pause, is_last = 0.0, False
+        while not is_last:
             self._wait(pause)
+            is_last = self._is_ending
             began = time.monotonic()
             news = self.look()
             took = time.monotonic() - began
@@ -102,10 +104,9 @@ class Poller:
     def _wait(self, pause: float) -> None:
         """Wait until the program is to be asked."""
         with self._changed:
-            if not self._looks:
-                self._changed.wait(pause)
-            self._changed.wait_for(lambda: self._looks or self._is_wanted())
-            self._looks = 0
+            self._changed.wait_for(lambda: self._is_due or self._is_ending, pause)
+            self._changed.wait_for(lambda: self._is_due or self._is_ending or self._is_wanted())
+            self._is_due = False
 
     def _is_wanted(self) -> bool:
         return not self._has_ended and (self._always or self._pages > 0)
