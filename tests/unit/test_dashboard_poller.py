@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from fiber._cli.asking import Ask
-from fiber._cli.dashboard_poller import News, Poller
+from fiber._cli.dashboard_poller import News, ProgramPoller
 from fiber._cli.failures import NO_ANSWER, NOT_FOUND, CommandError
 from fiber._engine.activity import Activity, WorkReport
 from fiber._monitor import client
@@ -57,8 +57,8 @@ class ScriptedProgram:
             yield {"death": {"name": "dead"}}
 
 
-def poller_of(ask: Ask) -> Poller:
-    return Poller(lambda: ask, lambda news: None, always=False)
+def poller_of(ask: Ask) -> ProgramPoller:
+    return ProgramPoller(lambda: ask, lambda news: None, always=False)
 
 
 def children_in(news: News) -> int:
@@ -148,7 +148,7 @@ def test_the_last_look_begins_after_the_end_was_asked_for() -> None:
         assert goes_on.wait(PATIENCE)
         yield from program.ask(request)
 
-    poller = Poller(lambda: ask, seen.append, always=True)
+    poller = ProgramPoller(lambda: ask, seen.append, always=True)
     poller.start()
     assert asked.wait(PATIENCE)
     poller.end(0.0)
@@ -160,7 +160,7 @@ def test_the_last_look_begins_after_the_end_was_asked_for() -> None:
 def test_a_program_is_asked_only_while_a_page_is_open() -> None:
     program = ScriptedProgram()
     came: queue.SimpleQueue[News] = queue.SimpleQueue()
-    poller = Poller(lambda: program.ask, came.put, always=False)
+    poller = ProgramPoller(lambda: program.ask, came.put, always=False)
     poller.start()
     poller.opened()
     assert came.get(timeout=PATIENCE).program is not None

@@ -19,7 +19,7 @@ import click
 
 from fiber._cli import local_logs
 from fiber._cli.asking import Ask, find_program
-from fiber._cli.dashboard_poller import PATIENCE, News, Poller
+from fiber._cli.dashboard_poller import PATIENCE, News, ProgramPoller
 from fiber._cli.failures import USAGE, CommandError
 from fiber._cli.local import find_local, only_program
 from fiber._cli.session import cluster_options
@@ -53,7 +53,7 @@ _OPENS = """<!doctype html>
     "--open/--no-open",
     "opens",
     default=None,
-    help="Open a browser.  Default: only if the command runs in a terminal.",
+    help="Open a browser.  Default: only in a terminal of a desktop.",
 )
 @click.option("--for-program", is_flag=True, hidden=True, help="Serve the program that started it.")
 @cluster_options
@@ -163,7 +163,7 @@ async def _started(
     *,
     always: bool,
     seen: Callable[[News], None] | None = None,
-) -> tuple[PageServer, Poller]:
+) -> tuple[PageServer, ProgramPoller]:
     """Start a server and the poller that it publishes; ``seen`` gets the news after it."""
     from fiber._cli.dashboard_server import PageServer, listen  # it needs aiohttp
 
@@ -178,7 +178,7 @@ async def _started(
         with contextlib.suppress(RuntimeError):  # the loop has ended, and this thread ends with it
             loop.call_soon_threadsafe(publish, news)
 
-    poller = Poller(find, pass_on, always=always)
+    poller = ProgramPoller(find, pass_on, always=always)
     server = PageServer(listen(port), poller.opened, poller.closed, output)
     await server.start()
     poller.start()

@@ -36,7 +36,7 @@ class News(NamedTuple):
     has_ended: bool = False
 
 
-class Poller:
+class ProgramPoller:
     """Thread that asks a program and passes on its ``News``.
 
     ``find`` returns the function that asks the program, and CommandError if there is no such

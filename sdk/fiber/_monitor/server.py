@@ -38,10 +38,10 @@ _LONGEST = 1 << 16
 _PATIENCE = 10.0
 """Seconds that a client may take to send its request, and to take a part of the answer."""
 
-Lines = dict[str, Any] | list[dict[str, Any]]
+AnswerLines = dict[str, Any] | list[dict[str, Any]]
 """A line of an answer, or lines that are sent together."""
 
-Answer = Callable[[dict[str, Any]], Iterable[Lines]]
+Answer = Callable[[dict[str, Any]], Iterable[AnswerLines]]
 
 
 class MonitorServer:
@@ -118,7 +118,7 @@ class MonitorServer:
         finally:
             self._clients.discard(client)
 
-    def _lines(self, client: socket.socket) -> Iterable[Lines]:
+    def _lines(self, client: socket.socket) -> Iterable[AnswerLines]:
         try:
             with client.makefile("rb") as stream:
                 request = json.loads(stream.readline(_LONGEST))
@@ -129,7 +129,7 @@ class MonitorServer:
             yield {"error": f"{type(error).__name__}: {error}"}
 
 
-def _encoded(lines: Lines) -> bytes:
+def _encoded(lines: AnswerLines) -> bytes:
     # Each call of the system lets a busy thread take Python's lock, so many lines need one call.
     listed = lines if isinstance(lines, list) else [lines]
     return b"".join(json.dumps(line).encode() + b"\n" for line in listed)

@@ -26,7 +26,7 @@ from types import FrameType
 from typing import Any, TypeVar, cast
 
 from fiber._engine.activity import Activity, ChildRecord
-from fiber._monitor.server import Lines
+from fiber._monitor.server import AnswerLines
 from fiber._runtime.children import Child, Children
 from fiber._runtime.pool_state import WatchedPool
 from fiber._transport.loop import Loop
@@ -63,7 +63,7 @@ class Monitor:
         self._backend = backend
         self._config = config
 
-    def answer(self, request: dict[str, Any]) -> Iterator[Lines]:
+    def answer(self, request: dict[str, Any]) -> Iterator[AnswerLines]:
         """Yield the lines of the answer."""
         yield {"program": self._program()}
         ask = request.get("ask")

@@ -25,7 +25,7 @@ from fiber._engine.activity import Activity
 from fiber._hub import client as hub_client
 from fiber._hub.handles import collecting_grants
 from fiber._hub.hub import Hub
-from fiber._monitor.server import Lines, MonitorServer
+from fiber._monitor.server import AnswerLines, MonitorServer
 from fiber._runtime import start_methods
 from fiber._runtime.children import Child, ChildOwner, Children
 from fiber._runtime.pool_state import WatchedPool
@@ -176,7 +176,7 @@ class Runtime:
         """
         return not self.elastic or self.config.dashboard or "KUBERNETES_SERVICE_HOST" in os.environ
 
-    def _answer_monitor(self, request: dict[str, Any]) -> Iterator[Lines]:
+    def _answer_monitor(self, request: dict[str, Any]) -> Iterator[AnswerLines]:
         from fiber._runtime.monitoring import Monitor  # rarely needed
 
         monitor = Monitor(
