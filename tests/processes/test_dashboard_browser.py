@@ -276,6 +276,14 @@ def test_the_output_of_the_program_is_shown_if_it_goes_to_a_file(page: Page) -> 
     expect(page.locator("#output-problem")).to_contain_text("its output goes to pipe")
 
 
+def test_the_output_can_be_filtered(page: Page) -> None:
+    page.route("**/output", lambda route: route.fulfill(json={"text": "[w-1] a\n[w-2] b\n"}))
+    page.locator("#show-output").click()
+    expect(page.locator("#output")).to_have_text("[w-1] a [w-2] b", timeout=MILLISECONDS)
+    page.locator("#output-filter").fill("[w-2]")
+    expect(page.locator("#output")).to_have_text("[w-2] b")
+
+
 def test_the_page_draws_a_thousand_workers(browser: Browser, tmp_path: Path) -> None:
     """The page's modules, with a model that no server sends."""
     folder = Path(client.__file__).parents[1] / "_cli" / "dashboard_page"

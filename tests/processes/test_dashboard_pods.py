@@ -66,7 +66,7 @@ def test_a_program_in_a_pod_is_shown_until_its_end(site: Site) -> None:
     assert update["activity"]["tasks"] == 50
     assert len(update["state"]["children"]) == 2
     assert update["program"]["backend"] == "local"
-    assert "`fiber logs mine`" in output["problem"]
+    assert "begun\n" in output["text"]
     interrupt(running)
     running.communicate(timeout=PATIENCE)
     *_, last, _ = asyncio.run(updates_until(found[0], "ended"))

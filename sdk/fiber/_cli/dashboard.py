@@ -22,6 +22,7 @@ from fiber._cli.asking import Ask, find_program
 from fiber._cli.dashboard_poller import PATIENCE, News, ProgramPoller
 from fiber._cli.failures import USAGE, CommandError
 from fiber._cli.local import find_local, only_program
+from fiber._cli.logs import last_lines
 from fiber._cli.session import cluster_options
 from fiber._monitor import client
 
@@ -202,10 +203,13 @@ def _tell_the_end(name: str) -> Callable[[News], None]:
 def _output(
     name: str, context: str | None, namespace: str | None, program: dict[str, Any]
 ) -> dict[str, Any]:
-    """Return the last lines of a program of this machine."""
-    if find_local(name, context, namespace) is None:
-        return {"problem": f"The program runs in a pod: `fiber logs {name}` shows its output."}
-    return _own_output(program)
+    """Return the last lines of a program, on this machine or in its pod."""
+    try:
+        if find_local(name, context, namespace) is None:
+            return {"text": last_lines(name, context, namespace)}
+        return _own_output(program)
+    except CommandError as error:
+        return {"problem": f"{error.what}: {error.why}"}
 
 
 def _own_output(program: dict[str, Any]) -> dict[str, Any]:

@@ -239,6 +239,8 @@ function drawProcesses() {
 
 // Output of the program
 
+let output = "";
+
 async function showOutput() {
   let answer;
   try {
@@ -248,12 +250,20 @@ async function showOutput() {
   }
   setText(find("output-problem"), answer.problem || "");
   find("output-problem").hidden = !answer.problem;
-  setText(find("output"), answer.text || "");
-  find("output").hidden = !answer.text;
+  output = answer.text || "";
+  filterOutput();
+}
+
+function filterOutput() {
+  const wanted = find("output-filter").value;
+  const lines = output.split("\n").filter((line) => line.includes(wanted));
+  setText(find("output"), lines.join("\n"));
+  find("output").hidden = !output;
   find("output").scrollTop = find("output").scrollHeight;
 }
 
 find("show-output").addEventListener("click", showOutput);
+find("output-filter").addEventListener("input", filterOutput);
 find("process-table").closest("details").addEventListener("toggle", drawProcesses);
 setInterval(() => model.activity && !document.hidden && drawAbout(), 1000);
 connect();
