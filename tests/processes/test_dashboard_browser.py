@@ -245,7 +245,7 @@ def test_the_timeline_is_one_canvas_that_keys_move(watched: WatchedProgram, page
 def test_the_page_fits_a_phone_in_both_themes(page: Page, scheme: Any) -> None:
     page.emulate_media(color_scheme=scheme)
     page.set_viewport_size({"width": 360, "height": 740})
-    assert page.evaluate("document.documentElement.scrollWidth") <= 360
+    page.wait_for_function("document.documentElement.scrollWidth <= 360")
     background = "getComputedStyle(document.body).backgroundColor"
     channels = [int(word) for word in re.findall(r"\d+", page.evaluate(background))[:3]]
     assert (sum(channels) > 380) == (scheme == "light")
