@@ -32,7 +32,7 @@ demo: $(VENV)/.with-rl
 	$(BIN)/python examples/02-es/main.py
 
 ## make test          every test; all parts run, and the last lines name those that failed
-test: $(VENV)/.with-dev $(VENV)/.with-stable-baselines3 $(VENV)/.with-jax $(VENV)/.with-testsuite
+test: $(VENV)/.with-dev $(VENV)/.with-stable-baselines3 $(VENV)/.with-jax $(VENV)/.with-testsuite $(VENV)/.with-browser
 	@PYTHONPATH=tests $(BIN)/python -m announcement $(OTHER_PYTHONS)
 	@failed=; \
 	for part in $(PARTS); do $(MAKE) --no-print-directory $$part || failed="$$failed $$part"; done; \
@@ -202,6 +202,10 @@ $(VENV)/.with-vector-peers: $(VENV)/.with-bench
 $(VENV)/.with-testsuite: $(VENV)/.made
 	.ci/python need-testsuite $(BIN)/python
 	touch $@
+
+# Chromium. Where it cannot be installed, the tests of the dashboard in a browser are skipped.
+$(VENV)/.with-browser: $(VENV)/.made
+	-.ci/browser && touch $@
 
 .venv-%/.made:
 	.ci/python make-venv .venv-$* "$$(.ci/python find $*)"

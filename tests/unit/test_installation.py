@@ -36,6 +36,13 @@ def test_the_wheel_holds_the_files_of_a_program(wheel: zipfile.Path) -> None:
     assert not wheel.joinpath("fiber", "__pycache__").exists()
 
 
+def test_the_wheel_holds_the_files_of_the_dashboard(wheel: zipfile.Path) -> None:
+    page = SDK / "_cli" / "dashboard_page"
+    for path in page.rglob("*"):
+        if path.is_file():
+            assert wheel.joinpath("fiber", str(path.relative_to(SDK))).read_bytes()
+
+
 def test_links_of_the_readme_lead_somewhere_from_a_package_index(wheel: zipfile.Path) -> None:
     (info,) = (each for each in wheel.iterdir() if each.name.endswith(".dist-info"))
     metadata = message_from_string(info.joinpath("METADATA").read_text(encoding="utf-8"))

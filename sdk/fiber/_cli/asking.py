@@ -3,30 +3,31 @@
 from __future__ import annotations
 
 import http.client
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 from fiber._cli.failures import NOT_FOUND, CommandError, explained
-from fiber._cli.local import find_local
+from fiber._cli.local import LocalProgram, find_local
 from fiber._cli.programs import LauncherClient, find_job, find_pod
-from fiber._cli.session import connect
+from fiber._cli.session import Session, connect
 from fiber._monitor import client
+
+Ask = Callable[[dict[str, Any]], Iterator[dict[str, Any]]]
+"""Function that asks a program, and yields the lines of its answer; CommandError, ``NoAnswer``."""
 
 
 def answer_of(
     name: str, request: dict[str, Any], context: str | None, namespace: str | None
 ) -> Iterator[dict[str, Any]]:
     """Yield the lines of a program's answer, on this machine or in its pod; CommandError."""
-    program = find_local(name, context, namespace)
+    where = ""
     try:
+        program = find_local(name, context, namespace)
         if program is not None:
-            yield from client.ask(program.socket, request)
-        else:
-            yield from _answer_of_pod(name, request, context, namespace)
+            where = f"; `py-spy dump --pid {program.pid}` may show where it is"
+        yield from _ask_of(name, program, context, namespace)(request)
     except client.NoAnswer as error:
-        where = (
-            "" if program is None else f"; `py-spy dump --pid {program.pid}` may show where it is"
-        )
         raise CommandError(
             f"cannot ask the program {name!r}",
             str(error),
@@ -34,10 +35,31 @@ def answer_of(
         ) from error
 
 
+def find_program(
+    name: str, context: str | None, namespace: str | None, patience: float = client.PATIENCE
+) -> Ask:
+    """Return the function that asks a program again and again; CommandError if it is not there.
+
+    ``patience``: seconds that a program of this machine may take for a part of its answer.
+    """
+    return _ask_of(name, find_local(name, context, namespace), context, namespace, patience)
+
+
+def _ask_of(
+    name: str,
+    program: LocalProgram | None,
+    context: str | None,
+    namespace: str | None,
+    patience: float = client.PATIENCE,
+) -> Ask:
+    if program is not None:
+        return partial(client.ask, program.socket, patience=patience)
+    return partial(_answer_of_pod, connect(context, namespace), name)
+
+
 def _answer_of_pod(
-    name: str, request: dict[str, Any], context: str | None, namespace: str | None
+    session: Session, name: str, request: dict[str, Any]
 ) -> Iterator[dict[str, Any]]:
-    session = connect(context, namespace)
     find_job(session, name)
     pod = find_pod(session, name)
     if pod is None or not pod.runs:

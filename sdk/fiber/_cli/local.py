@@ -64,6 +64,18 @@ def local_programs() -> list[LocalProgram]:
     return sorted(found, key=lambda program: program.facts.get("started") or 0.0)
 
 
+def only_program() -> str:
+    """Return the name of the program of this machine; CommandError unless there is one."""
+    programs = [program.name for program in local_programs()]
+    if len(programs) == 1:
+        return programs[0]
+    raise CommandError(
+        "the program is not named",
+        f"{len(programs) or 'no'} programs run on this machine",
+        f"name one of {', '.join(programs[:10])}" if programs else "name a program of the cluster",
+    )
+
+
 def find_local(name: str, context: str | None, namespace: str | None) -> LocalProgram | None:
     """Return this machine's program of that name or pid; None if there is none.
 

@@ -26,7 +26,7 @@ def show(program: LocalProgram, *, worker: str | None, follow: bool, since: str 
             "leave out --since",
             USAGE,
         )
-    path = _file(program) if worker is None else _file_of(program, worker)
+    path = _file(program.name, program.pid) if worker is None else _file_of(program, worker)
     with open(path, "rb") as log:
         process = os.pidfd_open(program.pid) if follow else -1
         try:
@@ -36,15 +36,26 @@ def show(program: LocalProgram, *, worker: str | None, follow: bool, since: str 
                 os.close(process)
 
 
-def _file(program: LocalProgram) -> str:
-    link = f"/proc/{program.pid}/fd/1"
+def tail(name: str, pid: int) -> str:
+    """Return the end of the file that a program's standard output goes to; CommandError."""
+    try:
+        with open(_file(name, pid), "rb") as log:
+            size = log.seek(0, os.SEEK_END)
+            log.seek(max(0, size - _PIECE))
+            return log.read(_PIECE).decode(errors="replace")
+    except OSError as error:
+        raise CommandError(f"cannot read the output of {name!r}", str(error)) from error
+
+
+def _file(name: str, pid: int) -> str:
+    link = f"/proc/{pid}/fd/1"
     try:
         place, mode = os.readlink(link), os.stat(link).st_mode
     except OSError:
         place, mode = "nothing", 0
     if not stat.S_ISREG(mode):
         raise CommandError(
-            f"there is no log of {program.name!r}",
+            f"there is no log of {name!r}",
             f"the program runs on this machine, and its output goes to {place}",
             "see it there, or start the program with its output in a file: "
             "python train.py >train.log 2>&1",

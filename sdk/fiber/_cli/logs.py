@@ -19,6 +19,9 @@ from fiber_api.rest import PODS, NotFound
 
 _UNITS = {"s": 1, "m": 60, "h": 3600, "d": 86_400}
 _BROKEN_PIPE = 141
+_TAIL, _MOST_BYTES = "500", str(1 << 20)
+"""Lines at the end of a log, and most of their bytes."""
+
 _WHY_EMPTY = {
     names.PROGRAM_CONTAINER: "the log is empty; a node keeps only the last 10 MiB or so of it",
     names.WORKER_CONTAINER: (
@@ -96,6 +99,17 @@ def _show_now(session: Session, pod: str, query: dict[str, str]) -> bool:
         streams.write(piece)
         found = True
     return found
+
+
+def last_lines(name: str, context: str | None, namespace: str | None) -> str:
+    """Return the end of the log of a program in a pod; CommandError."""
+    session = connect(context, namespace)
+    find_job(session, name)
+    pod = _pod(session, name)
+    query = {"container": names.PROGRAM_CONTAINER, "tailLines": _TAIL, "limitBytes": _MOST_BYTES}
+    with explained(f"read the log of {pod}"):
+        pieces = list(session.api.log(PODS.path(session.namespace, pod), query))
+    return b"".join(pieces).decode(errors="replace")
 
 
 def _pod(session: Session, program: str) -> str:

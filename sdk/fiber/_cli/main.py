@@ -19,6 +19,7 @@ _COMMANDS = {
     "logs": "Show the output of a program, or of a worker.",
     "stop": "End a program.",
     "top": "Show what a program does now.",
+    "dashboard": "Serve a live page of a program.",
     "stack": "Show where a program and its workers are in their code.",
     "pool": "List, make and scale FiberPools.",
     "doctor": "Find out why programs do not get workers.",

@@ -11,7 +11,7 @@ import click
 
 from fiber._cli.asking import answer_of
 from fiber._cli.failures import CommandError
-from fiber._cli.local import local_programs
+from fiber._cli.local import only_program
 from fiber._cli.session import cluster_options
 from fiber._cli.top_view import Sample, frame
 
@@ -36,24 +36,13 @@ def command(
       fiber top
       fiber top train-4f2a1 --once
     """
-    name = name or _only_program()
+    name = name or only_program()
     states = _states(name, context, namespace, interval, once)
     if sys.stdout.isatty() and not once:
         _draw(states)
     else:
         for shown in states:
             click.echo(shown + "\n")
-
-
-def _only_program() -> str:
-    programs = [program.name for program in local_programs()]
-    if len(programs) == 1:
-        return programs[0]
-    raise CommandError(
-        "the program is not named",
-        f"{len(programs) or 'no'} programs run on this machine",
-        f"name one of {', '.join(programs[:10])}" if programs else "name a program of the cluster",
-    )
 
 
 def _states(

@@ -38,7 +38,10 @@ _LONGEST = 1 << 16
 _PATIENCE = 10.0
 """Seconds that a client may take to send its request, and to take a part of the answer."""
 
-Answer = Callable[[dict[str, Any]], Iterable[dict[str, Any]]]
+AnswerLines = dict[str, Any] | list[dict[str, Any]]
+"""A line of an answer, or lines that are sent together."""
+
+Answer = Callable[[dict[str, Any]], Iterable[AnswerLines]]
 
 
 class MonitorServer:
@@ -49,7 +52,7 @@ class MonitorServer:
         self._loop = loop
         self._answer = answer
         self._clients: set[socket.socket] = set()
-        self._path = os.path.join(directory, SOCKET)
+        self.path = os.path.join(directory, SOCKET)
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
         try:
             self._listen(os.path.join(directory, _UNFINISHED))
@@ -62,13 +65,13 @@ class MonitorServer:
         # A socket that does not listen yet would look like that of a killed program.
         self._listener.bind(unfinished)
         self._listener.listen(_BACKLOG)
-        os.rename(unfinished, self._path)
+        os.rename(unfinished, self.path)
 
     def close(self) -> None:
         """Refuse clients, and end the answers.  Runs after the end of the loop."""
         self._listener.close()
         with contextlib.suppress(OSError):
-            os.unlink(self._path)
+            os.unlink(self.path)
         for client in list(self._clients):
             with contextlib.suppress(OSError):
                 client.shutdown(socket.SHUT_RDWR)
@@ -110,12 +113,12 @@ class MonitorServer:
         try:
             client.settimeout(_PATIENCE)
             with client, contextlib.suppress(OSError):
-                for line in self._lines(client):
-                    client.sendall(json.dumps(line).encode() + b"\n")
+                for lines in self._lines(client):
+                    client.sendall(_encoded(lines))
         finally:
             self._clients.discard(client)
 
-    def _lines(self, client: socket.socket) -> Iterable[dict[str, Any]]:
+    def _lines(self, client: socket.socket) -> Iterable[AnswerLines]:
         try:
             with client.makefile("rb") as stream:
                 request = json.loads(stream.readline(_LONGEST))
@@ -124,3 +127,9 @@ class MonitorServer:
             raise
         except Exception as error:  # the client shows it
             yield {"error": f"{type(error).__name__}: {error}"}
+
+
+def _encoded(lines: AnswerLines) -> bytes:
+    # Each call of the system lets a busy thread take Python's lock, so many lines need one call.
+    listed = lines if isinstance(lines, list) else [lines]
+    return b"".join(json.dumps(line).encode() + b"\n" for line in listed)

@@ -27,6 +27,7 @@ from types import FrameType
 from typing import Any, TypeVar, cast
 
 from fiber._engine.activity import Activity, ChildRecord
+from fiber._monitor.server import AnswerLines
 from fiber._output_files import program_name
 from fiber._runtime.activity_reading import on_loop, snapshot
 from fiber._runtime.children import Child, Children
@@ -65,13 +66,13 @@ class Monitor:
         self._backend = backend
         self._config = config
 
-    def answer(self, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    def answer(self, request: dict[str, Any]) -> Iterator[AnswerLines]:
         """Yield the lines of the answer."""
         yield {"program": self._program()}
         ask = request.get("ask")
         if ask == "state":
             self._measure()
-            yield from self._on_loop(self._state)
+            yield self._on_loop(self._state)
         elif ask == "activity":
             yield {"activity": self._on_loop(partial(self._snapshot, request.get("since", 0)))}
         elif ask == "stacks":

@@ -25,7 +25,7 @@ from fiber._engine.activity import Activity
 from fiber._hub import client as hub_client
 from fiber._hub.handles import collecting_grants
 from fiber._hub.hub import Hub
-from fiber._monitor.server import MonitorServer
+from fiber._monitor.server import AnswerLines, MonitorServer
 from fiber._output_files import program_name, usable
 from fiber._runtime import start_methods
 from fiber._runtime.children import Child, ChildOwner, Children
@@ -39,6 +39,7 @@ from fiber.resources import resources_of
 if TYPE_CHECKING:
     from fiber._agent.interface import Backend
     from fiber._backends.shipping import PackedProgram, Shipping
+    from fiber._runtime.dashboard import DashboardProcess
     from fiber._runtime.metrics import MetricsServer
     from fiber._runtime.records import RecordReader
     from fiber._runtime.timeline import TimelineAtEnd
@@ -69,6 +70,7 @@ class Runtime:
         self._monitor: MonitorServer | None = None
         self.metrics: MetricsServer | None = None
         """Server of the program's metrics, if it was asked for."""
+        self._dashboard: DashboardProcess | None = None
         self._can_be_watched = not child.host
         """True until the loop has opened the monitor, or has found that it cannot."""
         self._records: RecordReader | None = None
@@ -205,17 +207,31 @@ class Runtime:
             address = self.hub.address_or_problem if self._cleans_up() else self.hub.known_address
             if address is not None and (directory := os.path.dirname(address.path)):
                 self._monitor = MonitorServer(self.loop, directory, self._answer_monitor)
+            if self.config.dashboard:
+                self._open_dashboard()
         except (OSError, FiberError) as error:
             _logs.debug("this program cannot be watched: %s", error)
+            if self.config.dashboard:
+                _warn_of_no_dashboard(error)
+
+    def _open_dashboard(self) -> None:
+        from fiber._runtime.dashboard import DashboardProcess  # rarely needed
+        from fiber._runtime.monitoring import program_facts
+
+        if self._monitor is None:
+            raise FiberError("this process has no directory for its socket")
+        name = program_facts()["name"]
+        self._dashboard = DashboardProcess(self.loop, self._monitor.path, name)
 
     def _cleans_up(self) -> bool:
         """Return whether the hub's directory goes when this program is killed.
 
-        Zygotes and agents of this host remove it, or it goes with the pod of the program.
+        Zygotes and agents of this host remove it, or the process of the dashboard, or it goes with
+        the pod of the program.
         """
-        return not self.elastic or "KUBERNETES_SERVICE_HOST" in os.environ
+        return not self.elastic or self.config.dashboard or "KUBERNETES_SERVICE_HOST" in os.environ
 
-    def _answer_monitor(self, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    def _answer_monitor(self, request: dict[str, Any]) -> Iterator[AnswerLines]:
         from fiber._runtime.monitoring import Monitor  # rarely needed
 
         monitor = Monitor(
@@ -286,6 +302,8 @@ class Runtime:
     def close(self) -> None:
         """End every child, agent and thread.  Runs on any thread but the loop's."""
         _logs.debug("ending all processes and agents")
+        if self._dashboard is not None:
+            self._dashboard.close()
         self.backend.close()
         if self.metrics is not None:
             self.metrics.close()
@@ -297,6 +315,8 @@ class Runtime:
 
     def forget(self) -> None:
         """Close what a forked copy of this process must not hold."""
+        if self._dashboard is not None:
+            self._dashboard.forget()
         if self._monitor is not None:
             with contextlib.suppress(OSError):
                 self._monitor.forget()
@@ -326,6 +346,12 @@ class SharedArguments:
                 self._blob = Blob(data)
             self._tried = True
         return self._blob
+
+
+def _warn_of_no_dashboard(error: Exception) -> None:
+    if sys.stderr is not None:
+        with contextlib.suppress(OSError, ValueError):
+            print(f"fiber: this program has no dashboard: {error}", file=sys.stderr)
 
 
 def _make_backend(runtime: Runtime) -> Backend:
