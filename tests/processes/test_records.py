@@ -237,9 +237,11 @@ PROGRAM = """
     import fiber, logging, sys
     def work(number):
         logging.getLogger("w").info("task %d", number)
-    if __name__ == "__main__":
+    if __name__ == "__main__" or CONFIGURES_AT_IMPORT:
         form = "%(levelname)s %(processName)s %(message)s"
         logging.basicConfig(level="INFO", format=form, stream=sys.stdout)
+    if __name__ == "__main__":
+        fiber.set_start_method("METHOD")
         fiber.init(log_records="INFO")
         child = fiber.Process(target=work, args=(5,), name="child")
         child.start()
@@ -249,10 +251,11 @@ PROGRAM = """
 
 @pytest.mark.parametrize("env", [{}, LOOPBACK], ids=BACKENDS)
 @pytest.mark.parametrize("method", ["fork", "spawn"])
-def test_the_last_records_are_there_at_the_end_of_the_program(
-    env: dict[str, str], method: str
+@pytest.mark.parametrize("at_import", [False, True])
+def test_the_last_records_are_there_once_at_the_end_of_the_program(
+    env: dict[str, str], method: str, at_import: bool
 ) -> None:
-    script = PROGRAM.replace("fiber.init", f'fiber.set_start_method("{method}"); fiber.init')
+    script = PROGRAM.replace("METHOD", method).replace("CONFIGURES_AT_IMPORT", str(at_import))
     program = Program(script, env=env)
     try:
         assert program.finish() == "INFO child task 5\n"

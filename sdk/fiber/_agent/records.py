@@ -35,13 +35,15 @@ passed: tuple[str, bytes] | None = None
 def install(level: str, way: bytes) -> None:
     """Send records of ``level`` and above to the program; ``way`` is a pickled channel to it.
 
-    Runs before the main module is imported: a ``basicConfig`` there does nothing in a child.
+    The sender takes the place of the root logger's handlers.  Where the main module was imported
+    before the fork, its ``basicConfig`` has added one.  Where it is imported later, its
+    ``basicConfig`` does nothing.  So the program's handlers alone get each record.
     """
     global passed
     passed = level, way
     sender = RecordSender(level, way)
     root = logging.getLogger()
-    root.addHandler(sender)
+    root.handlers[:] = [sender]
     if root.level > sender.level:
         root.setLevel(sender.level)
     atexit.register(sender.finish)
