@@ -13,7 +13,7 @@ from fiber import resources
 
 
 class KeyRule(NamedTuple):
-    """KeyRule for the values of a key.  `check` returns the value to keep, or raises ValueError."""
+    """Rule for the values of a key.  `check` returns the value to keep, or raises ValueError."""
 
     expects: str
     check: Callable[[object], object]

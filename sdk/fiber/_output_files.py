@@ -65,12 +65,14 @@ class OutputFile:
     def __init__(self, folder: str, program: str, child: str) -> None:
         self._start = os.path.join(folder, stem_of(program, child))
         self._path = ""
+        self._lock = threading.Lock()
         self.left_out = 0
         """Lines that were dropped since the last write."""
 
     def append(self, data: bytes) -> None:
         """Append whole lines; OSError if that is not possible."""
-        descriptor = self._open()
+        with self._lock:
+            descriptor = self._open()
         try:
             while data:
                 data = data[os.write(descriptor, data) :]
@@ -129,7 +131,9 @@ class OutputKeeper:
     def close(self) -> None:
         """Write the queued lines, and end the thread."""
         self._queue.put(None)
-        if self._thread is not None:
+        if self._thread is None:
+            self._run()
+        else:
             self._thread.join(timeout=2)
 
     def _run(self) -> None:

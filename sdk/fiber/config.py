@@ -102,9 +102,9 @@ class Config:
         how often in a row a vector environment makes its environments again for that reason.
     log_level: the least severe level that is shown on stderr, in children, too, as by
         `fiber.log_to_stderr()`. "DEBUG" shows each start and end of workers, agents and links.
-    progress: whether maps show their progress that are not called with `progress=`: "always",
-        "never", or "auto", which means in a terminal or a notebook. They show it once they have run
-        for half a second. Children do not.
+    progress: whether maps without `progress=` show their progress: "always", "never", or "auto",
+        which means in a terminal or a notebook. They show it once they have run for half a second.
+        Children do not.
     dashboard*: start the program's live page at its first process, and print the page's address.
         See `fiber dashboard`.
     timeline*: write the program's timeline at its end to this file. The suffix chooses the form, as

@@ -80,7 +80,7 @@ class FiberError(ProcessError):
 
     When: never itself. `except fiber.FiberError` catches all of them.
 
-    What to do: read the message, which ends with that.
+    What to do: read the message. It ends with what to do.
     """
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -326,7 +326,7 @@ class VersionMismatch(FiberError):
 
     `what` says which one: "Fiber protocol" or "Python", for instance.
 
-    When: a version mismatch: the image of workers has another fiberpool or Python than the
+    When: the image of workers has another fiberpool or Python than the
     program.
 
     What to do: rebuild the image with the program's versions: `fiber image build`.
@@ -358,7 +358,7 @@ class WorkerDied(FiberError):
     When: a task's worker died in each of its 1 + `retries` runs, or the cluster ended more than
     `disruptions` of them.
 
-    What to do: the message ends with it, by the way in which the worker ended.
+    What to do: read the message. Its end depends on how the worker ended.
     """
 
     def __init__(

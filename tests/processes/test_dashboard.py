@@ -31,6 +31,9 @@ if __name__ == "__main__":
         if "--fork" in sys.argv:
             child = os.fork()
             if not child:
+                if "--use" in sys.argv:
+                    with fiber.Pool(1) as pool:
+                        pool.map(abs, range(10))
                 print("forked", flush=True)
                 os.read(0, 1)
                 os._exit(0)
@@ -103,6 +106,26 @@ def test_the_page_is_served_while_the_program_runs(start: Callable[..., Program]
     go_on(program)
     program.finish()
     assert program.stderr.count("token=") == 1
+
+
+def test_the_page_imports_nothing_from_the_working_directory(
+    start: Callable[..., Program], tmp_path: Path
+) -> None:
+    (tmp_path / "secrets.py").write_text("raise SystemExit('imported')")
+    program = start("--dashboard", cwd=tmp_path)
+    assert status_of(address_of(program)) == 200
+    go_on(program)
+    program.finish()
+
+
+def test_a_copy_of_the_program_that_uses_fiber_has_no_page(start: Callable[..., Program]) -> None:
+    program = start("--dashboard", "--fork", "--use")
+    assert program.line() == "forked"
+    address_of(program)
+    assert len(dashboards(program)) == 1
+    assert program.stderr.count("token=") == 1
+    program.kill()
+    wait_for(lambda: not dashboards(program), what="the end of the page")
 
 
 def test_a_killed_program_takes_its_page_along(start: Callable[..., Program]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import queue
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -139,6 +140,28 @@ def test_an_unknown_worker_is_said_to_be_unknown(pool: Pool) -> None:
     (line,) = ask(ask="stacks", worker="nobody")
     assert line["unknown"] == "nobody"
     assert line["names"] == [pool.workers()[0].name]
+
+
+def test_a_request_with_a_bad_value_is_an_error(pool: Pool) -> None:
+    pool.apply(abs, (-1,))
+    (line,) = ask(ask="activity", since="yesterday")
+    assert line["error"].startswith("TypeError")
+
+
+def test_a_number_of_thousands_of_digits_is_no_fault(pool: Pool) -> None:
+    pool.map_async(tasks.hang_with, [10**5000], chunksize=1)
+    assert wait_until(lambda: bool(state()["pool"][0]["slowest"]), PATIENCE)
+    (task,) = state()["pool"][0]["slowest"]
+    assert (task["task"], task["argument"]) == ("task 0 of hang_with()", "")
+
+
+def test_two_monitors_may_measure_at_once(pool: Pool) -> None:
+    pool.apply(abs, (-1,))
+    (child,) = state_module.runtime().children
+    answers: queue.SimpleQueue[str] = queue.SimpleQueue()
+    state_module.runtime().loop.call_soon(child.measure, lambda: answers.put("one"))
+    state_module.runtime().loop.call_soon(child.measure, lambda: answers.put("two"))
+    assert {answers.get(timeout=PATIENCE) for _ in range(2)} == {"one", "two"}
 
 
 def test_an_unknown_question_is_an_error(pool: Pool) -> None:

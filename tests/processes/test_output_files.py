@@ -7,6 +7,7 @@ import io
 import os
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -226,6 +227,20 @@ def test_the_first_error_of_the_keeper_is_told(tmp_path: Path) -> None:
     keeper.close()
     assert len(told) == 1
     assert "No space left on device" in told[0]
+    assert contents(tmp_path, "c") == "kept\n"
+
+
+def test_lines_are_written_at_the_end_if_no_thread_can_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    keeper = OutputKeeper(str(tmp_path), print)
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, "start", refuse)
+        keeper.write(keeper.file("c"), "kept")
+    keeper.close()
     assert contents(tmp_path, "c") == "kept\n"
 
 

@@ -109,6 +109,33 @@ def test_spans_become_coarse_and_keep_their_sums() -> None:
     assert all(one[1] <= other[0] for one, other in itertools.pairwise(spans))
 
 
+def test_functions_in_turn_do_not_make_the_record_coarse_or_large() -> None:
+    record = Activity(START, spans=100)
+    child = working(record)
+    record.ended(working(record, name="ended"), START)
+    for answer in range(10_000):
+        begin = START + answer / 1000
+        record.worked(child, WorkReport("fg"[answer % 2], begin, begin + 0.001, 0.001, 1))
+    found = record.snapshot(START + 10)
+    assert found["forgotten"] == 0
+    assert found["resolution"] < 0.1
+    assert sum(len(child["spans"]) for child in found["children"]) <= 101
+
+
+def test_a_lost_run_is_no_part_of_a_span_of_work() -> None:
+    record = Activity(START, spans=10)
+    child = working(record)
+    record.worked(child, WorkReport("f", START, START + 1, 1.0, 5))
+    record.worked(child, WorkReport("f", START + 1, START + 100, 0.0, 0))
+    expected = [[0, 1, "f", 1.0, 5, 0], [1, 100, "f", 0.0, 0, 0]]
+    assert spans_of(record.snapshot(START + 100)) == expected
+    other = working(record)
+    for second in range(200, 220):
+        record.worked(other, WorkReport("f", START + second, START + second, 0.0, 1))
+    first, _ = record.snapshot(START + 300)["children"]
+    assert first["spans"] == expected
+
+
 def test_merged_spans_replace_all_earlier_snapshots() -> None:
     record = Activity(START, spans=10)
     child = working(record)

@@ -81,6 +81,20 @@ def test_the_second_look_asks_for_changes_only() -> None:
     assert children_in(poller.look()) == 1
 
 
+def test_what_changed_is_asked_for_again_after_a_failure() -> None:
+    program = ScriptedProgram()
+    failures: list[Exception] = [client.NoAnswer("no state")]
+
+    def ask(request: Facts) -> Iterator[Facts]:
+        if request["ask"] == "state" and failures:
+            raise failures.pop()
+        return program.ask(request)
+
+    poller = poller_of(ask)
+    assert poller.look().problem == "no state"
+    assert children_in(poller.look()) == 1
+
+
 def test_a_new_record_of_the_program_is_read_whole() -> None:
     program = ScriptedProgram()
     poller = poller_of(program.ask)

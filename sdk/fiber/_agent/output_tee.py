@@ -1,7 +1,7 @@
 """Output of a child of this host, which goes to a file, too.
 
-The child itself writes the file, so its output stays as it is: the same terminal, the same order,
-and nobody reads it in between.  Only what leaves by ``sys.stdout`` and ``sys.stderr`` is kept, and
+The child itself writes the file, so its output stays as it is: the same terminal and the same
+order.  Only what leaves by ``sys.stdout`` and ``sys.stderr`` is kept, and
 not what native code and other programs write to the descriptors.
 """
 

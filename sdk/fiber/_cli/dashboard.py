@@ -187,11 +187,11 @@ async def _started(
 
 
 def _tell_the_end(name: str) -> Callable[[News], None]:
-    told: list[str] = []
+    printed: list[str] = []
 
     def seen(news: News) -> None:
-        if news.has_ended and not told:
-            told.append(name)
+        if news.has_ended and not printed:
+            printed.append(name)
             click.echo(f"The program {name} has ended.  Its page stays until Ctrl-C.", err=True)
 
     return seen

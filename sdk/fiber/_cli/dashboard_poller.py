@@ -132,7 +132,6 @@ class ProgramPoller:
         if not activity["complete"] and not same_start(activity["start"], self._start):
             self._since = 0
             activity = self._activity(ask)
-        self._since, self._start = activity["revision"], activity["start"]
         program, lines = self._chosen(ask({"ask": "state"}))
         state: dict[str, list[dict[str, Any]]] = {"pools": [], "children": [], "deaths": []}
         kinds = {"pool": "pools", "child": "children", "death": "deaths"}
@@ -140,6 +139,8 @@ class ProgramPoller:
             for kind, facts in line.items():
                 if kind in kinds:
                     state[kinds[kind]].append(facts)
+        # Only now: if the second answer fails, the first one is asked for again.
+        self._since, self._start = activity["revision"], activity["start"]
         return News(program, activity, state)
 
     def _activity(self, ask: Ask) -> dict[str, Any]:

@@ -2,8 +2,8 @@
 
 A request is answered only if
 
-* its ``Host`` is this machine's loopback, so that a name that an attacker's DNS points here is not,
-* its ``Origin``, if it has one, is the page's, so that pages of other servers are refused,
+* its ``Host`` is this machine's loopback; this refuses DNS rebinding,
+* its ``Origin``, if it has one, is the page's; this refuses pages of other servers,
 * it has the cookie that the printed address is exchanged for.
 """
 

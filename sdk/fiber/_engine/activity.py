@@ -111,7 +111,7 @@ class ChildRecord:
         self.work = 0.0
         """Seconds of work, with unpickling and pickling in the worker."""
         self.held = 0.0
-        """Seconds in which it had tasks.  Without ``work``, they were on the way.
+        """Seconds in which it had tasks.  ``held`` minus ``work`` is the time on the way.
 
         A call that its caller sent to the worker itself counts without its way.
         """
@@ -250,8 +250,9 @@ class Activity:
             self.died += 1
             self.deaths.append(record)
         self._ended.append(record)
-        if len(self._ended) > ENDED:
-            self._forget(self._ended.popleft())
+        if len(self._ended) > ENDED:  # several at a time: each time, the next snapshot is complete
+            for _ in range(ENDED // 10 or 1):
+                self._forget(self._ended.popleft())
 
     def worked(self, record: ChildRecord, work: WorkReport) -> None:
         """Note work that a worker has reported."""
@@ -269,7 +270,8 @@ class Activity:
         if spans:
             last = spans[-1]
             begin = max(begin, last.end)
-            if last.function == function and begin - last.end <= self.resolution:
+            follows = last.function == function and begin - last.end <= self.resolution
+            if follows and bool(last.tasks) == bool(tasks):
                 last.end = max(last.end, end)
                 last.work += seconds
                 last.tasks += tasks
@@ -302,17 +304,19 @@ class Activity:
         """Merge spans until at most half of them are left; forget ended children if need be."""
         self._rewritten = self._revision
         longest = max(record.spans[-1].end for record in self if record.spans) - self.start
-        while 2 * self._span_count > self._most_spans:
-            if self.resolution <= longest:
-                self.resolution *= 2
-                for record in self:
-                    record.spans = _merged(record.spans, self.resolution)
-                self._span_count = sum(len(record.spans) for record in self)
-            elif self._ended:
-                self._forget(self._ended.popleft())
-            else:  # one span for each living child
-                self._most_spans = 4 * self._span_count
-                return
+        self._merge()
+        while 2 * self._span_count > self._most_spans and self.resolution <= longest:
+            self.resolution *= 2
+            self._merge()
+        while 2 * self._span_count > self._most_spans and self._ended:
+            self._forget(self._ended.popleft())
+        # By now each child has two spans at most.
+        self._most_spans = max(self._most_spans, 4 * self._span_count)
+
+    def _merge(self) -> None:
+        for record in self:
+            record.spans = _merged(record.spans, self.resolution)
+        self._span_count = sum(len(record.spans) for record in self)
 
     def _forget(self, record: ChildRecord) -> None:
         del self._children[record.id]
@@ -432,6 +436,8 @@ def _merged(spans: list[WorkSpan], gap: float) -> list[WorkSpan]:
 
 
 def _alike(one: WorkSpan, other: WorkSpan, gap: float) -> bool:
+    if bool(one.tasks) != bool(other.tasks):
+        return False  # a lost run is no work
     is_short = min(one.end - one.begin, other.end - other.begin) <= gap
     return one.function == other.function or is_short
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import queue
 import time
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 from fiber._engine.activity import Activity
 from fiber._runtime.children import Children
@@ -19,19 +19,29 @@ _PATIENCE = 5.0
 
 
 def on_loop(loop: Loop, function: Callable[[], T]) -> T:
-    """Return the result of a function that runs on the loop thread."""
+    """Return the result of a function that runs on the loop thread, or raise its error."""
     if loop.on_thread():  # as in a finalizer that runs there
         return function()
     if loop.broken:
         raise FiberError("the program's event loop has ended, so its activity cannot be read")
-    answers: queue.SimpleQueue[T] = queue.SimpleQueue()
-    loop.call_soon(lambda: answers.put(function()))
+    answers: queue.SimpleQueue[tuple[T | None, Exception | None]] = queue.SimpleQueue()
+
+    def run() -> None:
+        try:
+            answers.put((function(), None))
+        except Exception as error:
+            answers.put((None, error))
+
+    loop.call_soon(run)
     try:
-        return answers.get(timeout=_PATIENCE)
+        result, error = answers.get(timeout=_PATIENCE)
     except queue.Empty:
         raise FiberError(
             f"the program's event loop has not answered within {_PATIENCE:.0f} s"
         ) from None
+    if error is not None:
+        raise error
+    return cast("T", result)
 
 
 def snapshot(activity: Activity, children: Children, now: float, since: int = 0) -> dict[str, Any]:

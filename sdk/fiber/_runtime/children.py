@@ -63,7 +63,7 @@ class Child:
         self._children = children
         self._grants = grants
         self._askers: list[Callable[[str], None]] = []
-        self._on_measured: Callable[[], None] | None = None
+        self._on_measured: list[Callable[[], None]] = []
 
     def begin(self, handle: ChildHandle) -> None:
         """Start the child."""
@@ -82,6 +82,7 @@ class Child:
         if self._grants:
             self._grants.release()
         self._children.exited(self, report)
+        self._answer_measures()
         self.showed_stack(f"It has ended: {report.describe()}.")
         self.owner.exited(report)
         self.handle = None  # it has this object as its observer: a cycle
@@ -96,17 +97,21 @@ class Child:
         self.handle.signal(SHOW)
 
     def measure(self, then: Callable[[], None]) -> None:
-        """Have the child measured, and call ``then`` when its record has the answer."""
+        """Measure the child; call ``then`` when its record has the answer, or it has ended."""
         assert self.handle is not None
-        self._on_measured = then
+        self._on_measured.append(then)
         self.handle.measure()
 
     def measured(self, usage: Usage) -> None:
         """Note the child's memory and processor time."""
         if self.owner.record is not None:
             self.owner.record.memory, self.owner.record.cpu = usage
-        if self._on_measured is not None:
-            self._on_measured()
+        self._answer_measures()
+
+    def _answer_measures(self) -> None:
+        waiting, self._on_measured = self._on_measured, []
+        for then in waiting:
+            then()
 
     def showed_stack(self, text: str) -> None:
         """Pass on the stacks to those that asked for them."""

@@ -40,8 +40,10 @@ class DashboardProcess:
         self._loop = loop
         self._output = OutputWriter()
         self._read = b""
+        executable, *arguments = interpreter_arguments(sys.executable, _STATEMENT)
         self._process = subprocess.Popen(
-            [*interpreter_arguments(sys.executable, _STATEMENT), "dashboard", "--for-program"],
+            # -P: the working directory may have modules with the names of other ones.
+            [executable, "-P", *arguments, "dashboard", "--for-program"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,

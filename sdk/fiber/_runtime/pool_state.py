@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import heapq
 import reprlib
 from collections import Counter
@@ -78,6 +79,14 @@ def _slowest(handles: Iterable[Any], now: float) -> list[RunningTask]:
     return [_running_task(handle, now) for handle in oldest]
 
 
+def _short_form(item: Any) -> str:
+    """Return the short form of an item, if its repr runs none of the user's code; else nothing."""
+    if work.is_plain([item]):
+        with contextlib.suppress(ValueError):  # Python writes no number of thousands of digits
+            return reprlib.repr(item)
+    return ""
+
+
 def _running_task(handle: Any, now: float) -> RunningTask:
     """Return the task that a busy worker runs: the first one of its batch without a result."""
     batch = handle.worker.queue[0]
@@ -86,7 +95,6 @@ def _running_task(handle: Any, now: float) -> RunningTask:
         at = min(batch.received, len(batch.items) - 1)
         item = batch.items[at]
         name = batch.job.owner.task_name(batch.start + at, item)
-        # Only for these types does repr run none of the user's code.
-        argument = reprlib.repr(item) if work.is_plain([item]) else ""
+        argument = _short_form(item)
     seconds = max(0.0, now - handle.worker.since)
     return RunningTask(name, handle.name, handle.host, seconds, argument)

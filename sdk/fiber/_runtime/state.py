@@ -71,6 +71,7 @@ class Runtime:
         self.metrics: MetricsServer | None = None
         """Server of the program's metrics, if it was asked for."""
         self._dashboard: DashboardProcess | None = None
+        self._news: _logs.OutputWriter | None = None
         self._can_be_watched = not child.host
         """True until the loop has opened the monitor, or has found that it cannot."""
         self._records: RecordReader | None = None
@@ -94,8 +95,8 @@ class Runtime:
             raise
 
     def _serve_metrics(self) -> None:
-        """Serve the metrics, unless this process is a child or a forked copy of a program."""
-        if self.config.metrics_port is None or child.host or _is_copy:
+        """Serve the metrics, if this process is a program."""
+        if self.config.metrics_port is None or not _is_program():
             return
         from fiber._runtime import metrics  # rarely needed
 
@@ -207,12 +208,13 @@ class Runtime:
             address = self.hub.address_or_problem if self._cleans_up() else self.hub.known_address
             if address is not None and (directory := os.path.dirname(address.path)):
                 self._monitor = MonitorServer(self.loop, directory, self._answer_monitor)
-            if self.config.dashboard:
+            if self.config.dashboard and _is_program():
                 self._open_dashboard()
         except (OSError, FiberError) as error:
             _logs.debug("this program cannot be watched: %s", error)
-            if self.config.dashboard:
-                _warn_of_no_dashboard(error)
+            if self.config.dashboard and _is_program():
+                self._news = _logs.OutputWriter()
+                self._news.write("fiber", f"this program has no dashboard: {error}")
 
     def _open_dashboard(self) -> None:
         from fiber._runtime.dashboard import DashboardProcess  # rarely needed
@@ -302,16 +304,19 @@ class Runtime:
     def close(self) -> None:
         """End every child, agent and thread.  Runs on any thread but the loop's."""
         _logs.debug("ending all processes and agents")
-        if self._dashboard is not None:
-            self._dashboard.close()
-        self.backend.close()
-        if self.metrics is not None:
-            self.metrics.close()
-        self.loop.stop()
-        if self._monitor is not None:
-            self._monitor.close()
-        self._close_records()
-        self._close_hub()
+        with contextlib.ExitStack() as parts:  # each ends, also if Ctrl-C comes meanwhile
+            parts.callback(self._close_hub)
+            parts.callback(self._close_records)
+            if self._monitor is not None:
+                parts.callback(self._monitor.close)
+            if self._news is not None:
+                parts.callback(self._news.close)
+            parts.callback(self.loop.stop)
+            if self.metrics is not None:
+                parts.callback(self.metrics.close)
+            parts.callback(self.backend.close)
+            if self._dashboard is not None:
+                parts.callback(self._dashboard.close)
 
     def forget(self) -> None:
         """Close what a forked copy of this process must not hold."""
@@ -346,12 +351,6 @@ class SharedArguments:
                 self._blob = Blob(data)
             self._tried = True
         return self._blob
-
-
-def _warn_of_no_dashboard(error: Exception) -> None:
-    if sys.stderr is not None:
-        with contextlib.suppress(OSError, ValueError):
-            print(f"fiber: this program has no dashboard: {error}", file=sys.stderr)
 
 
 def _make_backend(runtime: Runtime) -> Backend:
@@ -429,7 +428,15 @@ _may_link = True
 """True if this process may have agents on other hosts.  Their links need nng, which aborts in a
 forked copy of a process that has used it.  Such a copy runs its processes on its host."""
 _is_copy = False
-"""True in a forked copy of a program.  The program itself serves the metrics."""
+"""True in a forked copy of a program."""
+
+
+def _is_program() -> bool:
+    """Return whether this process is a program, and no process or copy of one.
+
+    Only a program has a dashboard, metrics and a timeline.
+    """
+    return not child.host and not _is_copy and mp_process.parent_process() is None
 
 
 def runtime() -> Runtime:
@@ -450,7 +457,7 @@ def _make() -> None:
         made = Runtime()
         if _runtime is None:  # else a finalizer has made one
             hub_client.set_local_hub(made.hub)
-            made.timeline = _make_timeline(made.config.timeline)
+            made.timeline = _make_timeline(made.config.timeline) if _is_program() else None
             util.Finalize(None, shutdown, exitpriority=_EXIT_PRIORITY)
             _runtime = made
     finally:

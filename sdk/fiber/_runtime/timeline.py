@@ -17,10 +17,8 @@ import secrets
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from multiprocessing import parent_process
 from typing import Any
 
-from fiber._agent import child
 from fiber._installation import explained_if_missing
 from fiber._runtime import trace_events
 from fiber._runtime.monitoring import program_facts
@@ -157,11 +155,8 @@ def _beside(path: str) -> str:
 
 
 def timeline_at_end(path: str | None) -> TimelineAtEnd | None:
-    """Return the timeline that the key asks for; None if this process writes none.
-
-    The processes of a program write none, and a program writes one.
-    """
-    if path is None or child.host or parent_process() is not None:
+    """Return the timeline that the key asks for; None if there is to be none, or it is written."""
+    if path is None:
         return None
     made = TimelineAtEnd(path)
     return None if made.path in _finished else made
