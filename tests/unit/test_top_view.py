@@ -57,16 +57,18 @@ def test_memory_and_processors_of_a_host_are_added_up() -> None:
     def used(pid: int, memory: int, cpu: float) -> dict[str, Any]:
         return {**child("a"), "pid": pid, "memory": memory, "cpu": cpu}
 
-    first = sample(1.0, children=[used(1, 1 << 20, 5.0), used(2, 1 << 20, 7.0)])
-    second = sample(3.0, children=[used(1, 3 << 20, 7.0), used(2, 1 << 20, 8.0), used(3, 0, 9.0)])
-    assert line_with(frame(first, None), "a  ") == ["a", "2", "2.0", "MiB"]
-    assert line_with(frame(second, first), "a  ") == ["a", "3", "4.0", "MiB", "1.5"]
+    first = sample(1.0, children=[used(1, 2_000_000, 5.0), used(2, 2_000_000, 7.0)])
+    second = sample(
+        3.0, children=[used(1, 4_000_000, 7.0), used(2, 2_000_000, 8.0), used(3, 0, 9.0)]
+    )
+    assert line_with(frame(first, None), "a  ") == ["a", "2", "4", "MB"]
+    assert line_with(frame(second, first), "a  ") == ["a", "3", "6", "MB", "1.5"]
 
 
 def test_losses_are_shown_when_there_are_some() -> None:
     totals = {"failed": 2, "retried": 0, "lost": 1, "bytes_sent": 2048, "bytes_received": 10}
     text = frame(sample(totals=[totals, totals]), None)
-    assert "\nfailed: 4   lost: 2   sent: 4.0 KiB   received: 20 B" in text
+    assert "\nfailed: 4   lost: 2   sent: 4.1 kB   received: 20 B" in text
     assert "retried" not in text
 
 

@@ -45,15 +45,6 @@ def counted(number: int, noun: str) -> str:
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
-def size(bytes_: float) -> str:
-    """Return a number of bytes in the unit that fits."""
-    for unit in ("B", "KiB", "MiB", "GiB"):
-        if bytes_ < 1024:
-            return f"{bytes_:.0f} {unit}" if unit == "B" else f"{bytes_:.1f} {unit}"
-        bytes_ /= 1024
-    return f"{bytes_:.1f} TiB"
-
-
 def age(since: float | None) -> str:
     """Return how long ago a unix time was, as kubectl writes it; empty for None."""
     if since is None:

@@ -9,6 +9,7 @@ from collections import Counter
 from typing import Any, NamedTuple
 
 from fiber._cli import display
+from fiber._runtime.summary import bytes_in_words
 
 _DEATHS = 5
 """Deaths that are shown, the last ones."""
@@ -69,7 +70,8 @@ def _counts(sample: Sample, before: Sample | None) -> str:
     ]
     counted = [(name, int(sample.total(name))) for name in ("failed", "retried", "lost")]
     more = [(name, str(count)) for name, count in counted if count]
-    more += [(word, display.size(sample.total(f"bytes_{word}"))) for word in ("sent", "received")]
+    for word in ("sent", "received"):
+        more.append((word, bytes_in_words(int(sample.total(f"bytes_{word}")))))
     return "\n".join("   ".join(map(": ".join, line)) for line in (facts, more))
 
 
@@ -130,7 +132,7 @@ def _workers(sample: Sample, before: Sample | None) -> str:
         [
             host,
             *(str(facts.states[state] or "") for state in columns),
-            display.size(facts.memory) if facts.memory else "",
+            bytes_in_words(facts.memory) if facts.memory else "",
             f"{facts.cpu:.1f}" if busy else "",
         ]
         for host, facts in shown

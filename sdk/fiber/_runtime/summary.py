@@ -344,7 +344,7 @@ def _lines(found: Summary) -> Iterator[str]:
         yield f"{'workers':<10} {', '.join(_shares(found.shares))}"
     yield (
         f"{'program':<10} {_seconds(found.pickling)} of pickling; "
-        f"{_bytes(found.bytes_sent)} sent, {_bytes(found.bytes_received)} received"
+        f"{bytes_in_words(found.bytes_sent)} sent, {bytes_in_words(found.bytes_received)} received"
     )
     yield from _labelled("functions", _function_lines(found))
     if found.slowest is not None:
@@ -401,7 +401,8 @@ def _counted(number: int, noun: str) -> str:
     return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
-def _bytes(number: int) -> str:
+def bytes_in_words(number: int) -> str:
+    """Return a number of bytes in the unit that fits."""
     size = float(number)
     for unit in ("B", "kB", "MB", "GB"):
         if size < 1000:
