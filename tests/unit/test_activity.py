@@ -160,6 +160,17 @@ def test_ended_children_are_forgotten_when_there_are_many(monkeypatch: pytest.Mo
     assert (found["forgotten"], found["tasks"]) == (7, 10)
 
 
+def test_a_child_that_never_ran_is_forgotten_and_its_death_is_kept() -> None:
+    record = Activity(START)
+    child = record.add_child("refused", START)
+    first = record.snapshot(START)
+    record.ended(child, START + 1, "no room")
+    later = record.snapshot(START + 1, first["revision"])
+    assert later["complete"]
+    assert later["children"] == []
+    assert [(death.name, death.reason) for death in record.deaths] == [("refused", "no room")]
+
+
 def test_children_with_a_span_each_stay_whole() -> None:
     record = Activity(START, spans=10)
     children = [working(record, name=str(number)) for number in range(50)]

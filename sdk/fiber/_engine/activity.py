@@ -249,6 +249,9 @@ class Activity:
         if reason:
             self.died += 1
             self.deaths.append(record)
+        if record.started is None:  # it never ran, and a program may try again without end
+            self._forget(record)
+            return
         self._ended.append(record)
         if len(self._ended) > ENDED:  # several at a time: each time, the next snapshot is complete
             for _ in range(ENDED // 10 or 1):
