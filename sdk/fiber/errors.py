@@ -326,7 +326,7 @@ class VersionMismatch(FiberError):
 
     `what` says which one: "Fiber protocol" or "Python", for instance.
 
-    When: the image of workers has another fiberpool or Python than the
+    When: there is a version mismatch. The image of workers has another fiberpool or Python than the
     program.
 
     What to do: rebuild the image with the program's versions: `fiber image build`.
