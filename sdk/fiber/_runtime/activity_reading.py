@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 from fiber._engine.activity import Activity
+from fiber._exceptions import fresh
 from fiber._runtime.children import Children
 from fiber._transport.loop import Loop
 from fiber.errors import FiberError
@@ -40,7 +41,7 @@ def on_loop(loop: Loop, function: Callable[[], T]) -> T:
             f"the program's event loop has not answered within {_PATIENCE:.0f} s"
         ) from None
     if error is not None:
-        raise error
+        raise fresh(error)
     return cast("T", result)
 
 
