@@ -114,7 +114,7 @@ class Config:
     metrics_port*: serve the program's metrics for Prometheus at this port of `metrics_host`. 0
         takes a free port, and prints the address. None serves none. It needs prometheus-client.
     metrics_host*: the address at which the metrics are served. In a pod, a scraper needs "0.0.0.0".
-    log_to*: also write the output of each worker, and of each other process, to a file of its own
+    log_to*: also write the output of each worker, and of each other process, to a separate file
         in this folder. See "Where is my print?" in the documentation.
     log_records*: the least severe level of `logging` records that children send to the program's
         handlers. None sends none.

@@ -1,8 +1,9 @@
-"""Fixture of several modules: the runtime of this very process on each backend."""
+"""Fixtures of several modules: the runtime of this process, and a machine without a cluster."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -13,3 +14,10 @@ from faults.runtime import BACKENDS, running_on
 def backend(request: pytest.FixtureRequest) -> Iterator[str]:
     """The runtime of this very process, on each backend in turn."""
     yield from running_on(request.param)
+
+
+@pytest.fixture
+def only_this_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No cluster is configured, and no other test's programs are seen."""
+    monkeypatch.setenv("KUBECONFIG", str(tmp_path / "none"))
+    monkeypatch.setenv("FIBER_RUNTIME_DIRECTORY", str(tmp_path))

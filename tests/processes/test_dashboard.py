@@ -43,11 +43,7 @@ if __name__ == "__main__":
 ADDRESS = re.compile(r"http://127\.0\.0\.1:\d+/\?token=\S+")
 
 
-@pytest.fixture(autouse=True)
-def _only_this_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No cluster is configured, and no other test's programs are seen."""
-    monkeypatch.setenv("KUBECONFIG", str(tmp_path / "none"))
-    monkeypatch.setenv("FIBER_RUNTIME_DIRECTORY", str(tmp_path))
+pytestmark = pytest.mark.usefixtures("only_this_machine")
 
 
 @pytest.fixture
