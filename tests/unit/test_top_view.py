@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from typing import Any
 
+from fiber._cli.dashboard_model import ProcessorShares
 from fiber._cli.top_view import Sample, frame
 
 
@@ -61,6 +62,9 @@ def test_memory_and_processors_of_a_host_are_added_up() -> None:
     second = sample(
         3.0, children=[used(1, 4_000_000, 7.0), used(2, 2_000_000, 8.0), used(3, 0, 9.0)]
     )
+    shares = ProcessorShares()
+    for one in (first, second):
+        shares.add_to(one.children, one.time)
     assert line_with(frame(first, None), "a  ") == ["a", "2", "4", "MB"]
     assert line_with(frame(second, first), "a  ") == ["a", "3", "6", "MB", "1.5"]
 

@@ -10,6 +10,7 @@ from typing import Any
 import click
 
 from fiber._cli.asking import answer_of
+from fiber._cli.dashboard_model import ProcessorShares
 from fiber._cli.failures import CommandError
 from fiber._cli.local import only_program
 from fiber._cli.session import cluster_options
@@ -50,8 +51,10 @@ def _states(
 ) -> Iterator[str]:
     """Yield the program's state as text, until the program ends."""
     before: Sample | None = None
+    shares = ProcessorShares()
     while True:
         sample = _sample(name, context, namespace)
+        shares.add_to(sample.children, sample.time)
         yield frame(sample, before)
         if once:
             return

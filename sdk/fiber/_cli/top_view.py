@@ -32,6 +32,7 @@ class Sample(NamedTuple):
     """Processes that use Fiber: one, unless a pod runs several."""
     pools: list[dict[str, Any]]
     children: list[dict[str, Any]]
+    """Processes with their ``share`` of a processor, as ``ProcessorShares`` sets it."""
     deaths: list[dict[str, Any]]
     totals: list[dict[str, Any]]
     """Totals of each of the programs."""
@@ -48,7 +49,7 @@ class Sample(NamedTuple):
 
 def frame(sample: Sample, before: Sample | None) -> str:
     """Return the text for a sample; ``before`` is the sample before it."""
-    parts = [_head(sample), _counts(sample, before), _workers(sample, before), _slowest(sample)]
+    parts = [_head(sample), _counts(sample, before), _workers(sample), _slowest(sample)]
     parts.append(_deaths(sample))
     return "\n\n".join(part for part in parts if part)
 
@@ -88,41 +89,26 @@ class HostFacts:
     def __init__(self) -> None:
         self.states: Counter[str] = Counter()
         self.memory = 0
-        self.cpu = 0.0
-        """Processors at work."""
+        self.cpu: float | None = None
+        """Processors at work; None if not known."""
 
-    def add(self, child: dict[str, Any], cpu: float) -> None:
+    def add(self, child: dict[str, Any]) -> None:
         """Count a process."""
         self.states[child["state"]] += 1
         self.memory += child.get("memory") or 0
-        self.cpu += cpu
+        share = child.get("share")
+        if share is not None:
+            self.cpu = (self.cpu or 0.0) + share
 
 
-def _busy_processors(sample: Sample, before: Sample | None) -> dict[tuple[str, int], float]:
-    """Return the processors that each process kept busy between two samples."""
-    if before is None or sample.time <= before.time:
-        return {}
-    first, last = (
-        {_key(c): c["cpu"] for c in one.children if c.get("cpu") is not None}
-        for one in (before, sample)
-    )
-    seconds = sample.time - before.time
-    return {key: max(0.0, last[key] - first[key]) / seconds for key in first.keys() & last.keys()}
-
-
-def _key(child: dict[str, Any]) -> tuple[str, int]:
-    return child["host"], child["pid"]
-
-
-def _workers(sample: Sample, before: Sample | None) -> str:
+def _workers(sample: Sample) -> str:
     """Return a table: for each host, its processes by state, their memory and processors."""
-    busy = _busy_processors(sample, before)
     hosts: dict[str, HostFacts] = {}
     total = HostFacts()
     for child in sample.children:
         host = child["host"] or "(no host yet)"
         for facts in (hosts.setdefault(host, HostFacts()), total):
-            facts.add(child, busy.get(_key(child), 0.0))
+            facts.add(child)
     if not hosts:
         return "no process or worker runs"
     columns = [state for state in _STATES if total.states[state]]
@@ -133,7 +119,7 @@ def _workers(sample: Sample, before: Sample | None) -> str:
             host,
             *(str(facts.states[state] or "") for state in columns),
             bytes_in_words(facts.memory) if facts.memory else "",
-            f"{facts.cpu:.1f}" if busy else "",
+            "" if facts.cpu is None else f"{facts.cpu:.1f}",
         ]
         for host, facts in shown
     ]
