@@ -101,7 +101,9 @@ OPERATOR = Image(
 )
 _WORKER_SOURCES = ("crds/fiber_api", "sdk/fiber")
 WORKER = Image("fiber-worker", "sdk/Dockerfile", _WORKER_SOURCES)
-WORKER_RL = Image("fiber-worker-rl", "sdk/Dockerfile", _WORKER_SOURCES, {"EXTRAS": "kubernetes,rl"})
+WORKER_RL = Image(
+    "fiber-worker-rl", "sdk/Dockerfile", _WORKER_SOURCES, {"EXTRAS": "kubernetes,metrics,rl"}
+)
 """Image that contains the packages that the examples import."""
 IMAGES = (OPERATOR, WORKER, WORKER_RL)
 SEARCH = Image("fiber-search", "examples/05-search/Dockerfile", (VERSION_FILE,), made_from=WORKER)

@@ -39,6 +39,7 @@ from cluster.filters import Allowed
 from cluster.images import Image
 from cluster.laptop import Laptop
 from cluster.shell import ClusterError, output, wait_for
+from patience import PATIENCE
 
 NODES = 2
 
@@ -98,10 +99,26 @@ class Cluster:
         self.kubectl("get", "--raw", "/readyz")
 
     def kill(self, pod: Mapping[str, Any], container: str) -> None:
-        """SIGKILL to a container of the pod, which is a document of the API."""
-        statuses = {status["name"]: status for status in pod["status"]["containerStatuses"]}
-        container_id = statuses[container]["containerID"].removeprefix("containerd://")
-        self._kill(pod["spec"]["nodeName"], container_id)
+        """SIGKILL to a container of the pod, which is a document of the API.
+
+        A container's program may answer before the API server knows the container's id.
+        """
+        found: list[str] = []
+
+        def has_id() -> bool:
+            found[:] = self._container_ids(pod["metadata"], container)
+            return bool(found)
+
+        wait_for(f"the id of {container}", has_id, seconds=PATIENCE)
+        self._kill(pod["spec"]["nodeName"], found[0].removeprefix("containerd://"))
+
+    def _container_ids(self, metadata: Mapping[str, Any], container: str) -> list[str]:
+        """Return the id of a pod's container; none before the API server knows it."""
+        where = ("--namespace", metadata["namespace"], "--output", "json")
+        pod = json.loads(self.kubectl("get", "pod", metadata["name"], *where))
+        statuses = pod["status"].get("containerStatuses", [])
+        ids = (each.get("containerID") for each in statuses if each["name"] == container)
+        return list(filter(None, ids))
 
     def bring(self, image: Image) -> str:
         """Have one more image on the nodes, of those that few tests need; its reference."""

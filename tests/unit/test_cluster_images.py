@@ -157,7 +157,7 @@ def test_a_build_sees_the_inputs_the_base_and_the_version_alone(
     for option in (
         "BASE_IMAGE=base-of-python:3.13-slim",
         "VERSION=1.2.3",
-        "EXTRAS=kubernetes,rl",
+        "EXTRAS=kubernetes,metrics,rl",
     ):
         assert option in builder.options
 
