@@ -49,5 +49,6 @@ class ConfigKeywords(TypedDict, total=False):
     metrics_port: int | None
     metrics_host: str
     log_to: str | os.PathLike[str] | None
+    log_times: bool
     log_records: LogLevel | None
     runtime_directory: str | os.PathLike[str] | None

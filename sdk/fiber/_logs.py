@@ -12,11 +12,12 @@ import queue
 import select
 import sys
 import threading
+import time
 from functools import partial
 from multiprocessing import util
 from typing import Any
 
-from fiber._output_files import OutputFile, OutputKeeper
+from fiber._output_files import OutputFile, OutputKeeper, with_time
 
 _mp: Any = util  # typeshed does not list its private names
 
@@ -75,10 +76,12 @@ class OutputWriter:
     """Writer of lines to stderr, on a thread.  A slow, stuck or broken stderr blocks no caller.
 
     Lines for which there is no room are dropped.  A line in their place says how many.  With
-    ``folder``, each child's lines go to a file there, too.
+    ``folder``, each child's lines go to a file there, too.  With ``times``, a child's line begins
+    with the time at which it came.
     """
 
-    def __init__(self, folder: str | None = None) -> None:
+    def __init__(self, folder: str | None = None, times: bool = False) -> None:
+        self._times = times
         self._keeper = (
             None if folder is None else OutputKeeper(folder, partial(self.write, "fiber"))
         )
@@ -109,6 +112,8 @@ class OutputWriter:
         self, name: str, host: str, text: str, file: OutputFile | None
     ) -> OutputFile | None:
         """Queue lines of a child, as ``write`` does; return its file, to be given the next time."""
+        if self._times:
+            text = with_time(text, time.time())
         self.write(f"{name}@{host}", text)
         if self._keeper is not None:
             file = file or self._keeper.file(name)

@@ -12,6 +12,7 @@ import queue
 import re
 import sys
 import threading
+import time
 import warnings
 from collections.abc import Callable
 
@@ -57,6 +58,14 @@ def usable(folder: str | None) -> str | None:
             stacklevel=2,
         )
         return None
+
+
+def with_time(text: str, now: float) -> str:
+    """Return lines with the local time before each, to the millisecond: ``now`` in unix time."""
+    seconds, milliseconds = divmod(int(now * 1000), 1000)
+    stamp = time.strftime(f"%Y-%m-%d %H:%M:%S.{milliseconds:03}", time.localtime(seconds))
+    lines, end = text.removesuffix("\n"), "\n" if text.endswith("\n") else ""
+    return "\n".join(f"{stamp} {line}" for line in lines.split("\n")) + end
 
 
 class OutputFile:

@@ -116,6 +116,8 @@ class Config:
     metrics_host*: the address at which the metrics are served. In a pod, a scraper needs "0.0.0.0".
     log_to*: also write the output of each worker, and of each other process, to a separate file
         in this folder. See "Where is my print?" in the documentation.
+    log_times*: put the time before each line of output of a process on another host, and before
+        each line in the files of `log_to`.
     log_records*: the least severe level of `logging` records that children send to the program's
         handlers. None sends none.
     runtime_directory*: where Fiber makes its private directory for sockets and credentials.
@@ -168,6 +170,7 @@ class Config:
     metrics_port: int | None = _key(None, rules.whole(0, 65535), fixed=True)
     metrics_host: str = _key("127.0.0.1", rules.word("a host name or address"), fixed=True)
     log_to: str | None = _key(None, rules.path(), fixed=True)
+    log_times: bool = _key(False, rules.switch(), fixed=True)
     log_records: LogLevel | None = _key(  # noqa: RUF009 - a field
         None, rules.choice(*get_args(LogLevel)), fixed=True
     )

@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from terminal import drawn
+from conformance.notebook import LIMIT, bar, outputs_of
 
 pytest.importorskip("tqdm", reason="tqdm is optional, as for users")
 
-TESTS = Path(__file__).parents[1]
-LIMIT = 120
 pytestmark = pytest.mark.timeout(LIMIT)
 
 BEGIN = """
@@ -41,37 +35,7 @@ print("over")
 
 def shown(folder: Path, backend: str, *cells: str) -> list[Any]:
     """Run cells in a kernel, and return the output of each."""
-    environment = {
-        **os.environ,
-        "FIBER_BACKEND": backend,
-        "PYTHONPATH": os.pathsep.join([str(TESTS), *filter(None, sys.path)]),
-        "HOME": str(folder),  # kernels keep their files there
-        "COLUMNS": "100",
-    }
-    done = subprocess.run(
-        [sys.executable, "-m", "conformance.notebook"],
-        cwd=folder,
-        env=environment,
-        input=json.dumps(cells),
-        capture_output=True,
-        text=True,
-        timeout=LIMIT,
-    )
-    assert done.returncode == 0, done.stderr
-    outputs: list[Any] = json.loads(done.stdout)
-    assert [output["error"] for output in outputs] == [""] * len(cells)
-    return outputs
-
-
-def bar(output: Any, name: str) -> str:
-    """Return the last state of the cell's bar, which is text, or the texts of a widget."""
-    if output["widgets"]:
-        assert output["displays"] == 1
-        values = [str(state.get("value", "")) for state in output["widgets"].values()]
-        return " ".join(values).replace("\u2007", " ")
-    lines = [line for line in drawn(output["stderr"]) if line.startswith(name)]
-    assert len(lines) == 1, output["stderr"]
-    return lines[0]
+    return outputs_of(folder, {"FIBER_BACKEND": backend}, *cells)
 
 
 @pytest.mark.parametrize("backend", ["local", "loopback"])

@@ -5,9 +5,11 @@ from __future__ import annotations
 import errno
 import io
 import os
+import re
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -19,8 +21,17 @@ from census import wait_until
 from faults.program import LOOPBACK, Program
 from faults.runtime import BACKENDS, running
 from fiber._agent.output_tee import TeeStream
-from fiber._output_files import OutputFile, OutputKeeper, program_name, stem_of, usable
+from fiber._output_files import (
+    OutputFile,
+    OutputKeeper,
+    program_name,
+    stem_of,
+    usable,
+    with_time,
+)
 from patience import PATIENCE
+
+TIME = r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d\.\d{3}"
 
 
 @pytest.fixture(params=BACKENDS)
@@ -67,6 +78,12 @@ def contents(folder: Path, child: str) -> str:
     return path.read_text() if path.exists() else ""
 
 
+def raw(folder: Path, child: str) -> str:
+    """Return the contents of a child's file with its ends of lines."""
+    path = folder / f"{program_name()}.{child}.log"
+    return path.read_bytes().decode() if path.exists() else ""
+
+
 def wait_for(folder: Path, child: str, text: str) -> None:
     assert wait_until(lambda: contents(folder, child) == text, PATIENCE), contents(folder, child)
 
@@ -99,6 +116,26 @@ def test_children_of_one_name_have_separate_files(folder: Path) -> None:
     wait_for(folder, "one", "first\nan error\nwithout an end\n")
     run(say, "second")
     wait_for(folder, "one.2", "second\nan error\nwithout an end\n")
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_each_line_of_a_file_has_its_time_if_that_is_wanted(backend: str, tmp_path: Path) -> None:
+    with running(backend=backend, log_to=str(tmp_path), log_times=True):
+        run(say, "first\rsecond", "")
+        lines = [f"{TIME} {text}\n" for text in ("first\rsecond", "", "an error", "without an end")]
+        pattern = re.compile("".join(lines))
+        assert wait_until(lambda: pattern.fullmatch(raw(tmp_path, "one")) is not None, PATIENCE)
+
+
+def test_a_time_is_local_and_has_milliseconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TZ", "UTC-2")
+    time.tzset()
+    try:
+        timed = with_time("one\n\n", 1_700_000_000.0625)
+    finally:
+        monkeypatch.undo()
+        time.tzset()
+    assert timed == "2023-11-15 00:13:20.062 one\n2023-11-15 00:13:20.062 \n"
 
 
 def test_no_name_leads_out_of_the_folder(folder: Path) -> None:

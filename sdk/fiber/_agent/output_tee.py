@@ -11,30 +11,34 @@ import atexit
 import contextlib
 import io
 import sys
+import time
 from multiprocessing import process as mp_process
 from typing import Any
 
 from fiber._agent.child import write_whole_lines
-from fiber._output_files import OutputFile
+from fiber._output_files import OutputFile, with_time
 
 _LONGEST = 1 << 16
 """Bytes of a line without an end that are kept back."""
 
-passed: tuple[str, str] | None = None
+passed: tuple[str, str, bool] | None = None
 """Arguments of ``install`` in this process, which its children get, too; None if not installed."""
 
 
-def install(folder: str, program: str) -> None:
-    """Have the standard streams of this process write to its file in ``folder``, too."""
+def install(folder: str, program: str, times: bool) -> None:
+    """Have the standard streams of this process write to its file in ``folder``, too.
+
+    ``times``: put the time before each line in the file.
+    """
     global passed
-    passed = folder, program
+    passed = folder, program, times
     file = OutputFile(folder, program, mp_process.current_process().name)
     for name, descriptor in (("stdout", 1), ("stderr", 2)):
         # The user may have closed or replaced the stream.
         with contextlib.suppress(AttributeError, OSError, ValueError):
             stream: Any = getattr(sys, name)
             if type(stream) is io.TextIOWrapper and stream.fileno() == descriptor:
-                _tee(stream, TeeStream(descriptor, f"<{name}>", file))
+                _tee(stream, TeeStream(descriptor, f"<{name}>", file, times))
     write_whole_lines()
 
 
@@ -49,10 +53,11 @@ def _tee(stream: Any, tee: TeeStream) -> None:
 class TeeStream(io.FileIO):
     """Raw stream of a descriptor, whose whole lines go to a file, too."""
 
-    def __init__(self, descriptor: int, name: str, file: OutputFile) -> None:
+    def __init__(self, descriptor: int, name: str, file: OutputFile, times: bool = False) -> None:
         super().__init__(descriptor, "wb", closefd=False)
         self.name = name
         self._file = file
+        self._times = times
         self._rest = b""
 
     def write(self, data: Any) -> int:
@@ -77,6 +82,10 @@ class TeeStream(io.FileIO):
             self._rest = b""
 
     def _append(self, data: bytes) -> None:
+        if data and self._times:
+            data = with_time(data.decode(errors="surrogateescape"), time.time()).encode(
+                errors="surrogateescape"
+            )
         if data:
             # A full disk, or a folder that is gone, costs only the lines in the file.
             with contextlib.suppress(OSError):

@@ -74,7 +74,7 @@ class LoopbackBackend:
         self._loop = loop
         self._hub = hub
         self._config = config
-        self._output = OutputWriter(config.log_to)
+        self._output = OutputWriter(config.log_to, config.log_times)
         self._failures = StartFailures()
         self._reasons: deque[tuple[str, str]] = deque(maxlen=_REASONS)
         self._gave_up = False

@@ -129,7 +129,9 @@ class Runtime:
             return []
         from fiber._agent import output_tee
 
-        passed = output_tee.passed if child.host else (folder, program_name())
+        passed = (
+            output_tee.passed if child.host else (folder, program_name(), self.config.log_times)
+        )
         return [] if passed is None else [(output_tee.install, passed)]
 
     def _close_records(self) -> None:

@@ -53,7 +53,7 @@ class KubernetesBackend:
         self._loop = loop
         self._hub = hub
         self._config = config
-        self._output = OutputWriter(config.log_to)
+        self._output = OutputWriter(config.log_to, config.log_times)
         self._shape = PodShape.of(config)
         self._provisioner = PoolProvisioner(config)
         self._pods: dict[tuple[PodShape | str, int], Pods] = {}

@@ -1,0 +1,35 @@
+"""Program that is watched from outside: tasks that end, and tasks that wait for a signal."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+
+import fiber
+
+
+def double(number: int) -> int:
+    """Return twice the number."""
+    return 2 * number
+
+
+def linger(_: int) -> None:
+    """Work until the worker is killed."""
+    signal.pause()
+
+
+def main() -> None:
+    """Run 100 tasks, then two that do not end; leave when both have lost their workers."""
+    fiber.init(retries=0)
+    with fiber.Pool(2) as pool:
+        total = sum(pool.map(double, range(100)))
+        results = [pool.apply_async(linger, (number,)) for number in range(2)]
+        print(json.dumps({"event": "waiting", "total": total, "pid": os.getpid()}), flush=True)
+        for result in results:
+            result.wait()
+    print(json.dumps({"event": "left"}), flush=True)
+
+
+if __name__ == "__main__":
+    main()
