@@ -155,6 +155,13 @@ def test_a_number_of_thousands_of_digits_is_no_fault(pool: Pool) -> None:
     assert (task["task"], task["argument"]) == ("task 0 of hang_with()", "")
 
 
+def test_the_arguments_of_a_call_are_shown(pool: Pool) -> None:
+    pool.apply_async(tasks.hang_with, ("a",))
+    assert wait_until(lambda: bool(state()["pool"][0]["slowest"]), PATIENCE)
+    (task,) = state()["pool"][0]["slowest"]
+    assert (task["task"], task["argument"]) == ("the call of hang_with()", "'a'")
+
+
 def test_two_monitors_may_measure_at_once(pool: Pool) -> None:
     pool.apply(abs, (-1,))
     (child,) = state_module.runtime().children

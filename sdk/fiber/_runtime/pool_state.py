@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import heapq
-import reprlib
 from collections import Counter
 from collections.abc import Iterable
 from typing import Any, NamedTuple, Protocol
 
 from fiber._engine.ledger import Ledger
-from fiber._wire import work
+from fiber._runtime.short_forms import short_form, short_form_of_call
+from fiber._runtime.work_items import Call
 
 SLOWEST = 10
 """Running tasks that a state names."""
@@ -26,7 +25,7 @@ class RunningTask(NamedTuple):
     seconds: float
     """Time since the worker began the task, or the batch that the task is in."""
     argument: str
-    """Short form of the argument of a map's task, if it is a plain value; else empty."""
+    """Short form of the item of a map, or of the arguments of a call; empty if it is not known."""
 
 
 class PoolState(NamedTuple):
@@ -79,14 +78,6 @@ def _slowest(handles: Iterable[Any], now: float) -> list[RunningTask]:
     return [_running_task(handle, now) for handle in oldest]
 
 
-def _short_form(item: Any) -> str:
-    """Return the short form of an item, if its repr runs none of the user's code; else nothing."""
-    if work.is_plain([item]):
-        with contextlib.suppress(ValueError):  # Python writes no number of thousands of digits
-            return reprlib.repr(item)
-    return ""
-
-
 def _running_task(handle: Any, now: float) -> RunningTask:
     """Return the task that a busy worker runs: the first one of its batch without a result."""
     batch = handle.worker.queue[0]
@@ -95,6 +86,12 @@ def _running_task(handle: Any, now: float) -> RunningTask:
         at = min(batch.received, len(batch.items) - 1)
         item = batch.items[at]
         name = batch.job.owner.task_name(batch.start + at, item)
-        argument = _short_form(item)
+        argument = _argument(item)
     seconds = max(0.0, now - handle.worker.since)
     return RunningTask(name, handle.name, handle.host, seconds, argument)
+
+
+def _argument(item: Any) -> str:
+    if isinstance(item, Call):
+        return short_form_of_call(item.data, item.buffers)
+    return short_form(item)
