@@ -272,6 +272,11 @@ def dumps(
     return _dump(_by_value_pickler(), obj, protocol, buffer_callback)
 
 
+def dumps_by_value(function: FunctionType) -> bytes:
+    """Pickle a function by value."""
+    return _dump(_by_value_pickler(), function)
+
+
 def encode(obj: Any) -> tuple[bytes, list[memoryview]]:
     """Pickle ``obj`` for a packet: the pickle, and large buffers beside it.
 
