@@ -161,7 +161,7 @@ def _values_of(function: FunctionType, names: Iterable[str]) -> list[object]:
 def _is_constant(value: object) -> bool:
     """Return whether ``value`` never changes, or travels by reference."""
     kind = type(value)
-    if kind in _CONSTANT or work.is_plain_value(value):
+    if kind in _CONSTANT or value is types.NoneType or work.is_plain_value(value):
         return True
     return isinstance(value, type | FunctionType | BuiltinFunctionType) and _is_importable(value)
 
@@ -173,8 +173,9 @@ def _parts_of(value: Any) -> Iterable[Any] | None:
     """Return the parts of a value that changes only if they do; None if it may change itself."""
     if type(value) in (tuple, frozenset):
         return tuple(value)
-    if type(value) in (types.GenericAlias, types.UnionType):  # in annotations
-        return (getattr(value, "__origin__", None), *value.__args__)
+    annotation = isinstance(value, types.GenericAlias | types.UnionType)
+    if annotation or type(value).__module__ == "typing":
+        return (getattr(value, "__origin__", None), *getattr(value, "__args__", ()))
     return None
 
 
