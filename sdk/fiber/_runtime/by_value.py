@@ -109,7 +109,7 @@ class _Reads(NamedTuple):
 class _Function(NamedTuple):
     """A function, and the objects of which it consists or which it reads."""
 
-    function: FunctionType
+    function: Any
     names: tuple[str, ...]
     """Names that may be those of globals."""
     values: list[object]
