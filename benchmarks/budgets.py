@@ -282,6 +282,7 @@ def _remote() -> Iterator[Budget]:
     rate = throughput.RATE
     for case in ("apply_async", f"apply_async, {throughput.OF_MAIN}"):
         yield budget(f"no-ops: {case}", "throughput", case, rate, 1, at_least=True)
+    yield from _kinds_of_functions()
     what = "no-op tasks, chunksize 1"
     yield budget(what, "throughput", "map, chunksize 1", rate, 20, at_least=True)
     for case in throughput.ARRAY_KINDS:
@@ -289,6 +290,19 @@ def _remote() -> Iterator[Budget]:
     for chunks in overhead.CHUNKS:
         case = overhead.case_name(0.001, chunks)
         yield budget(case, "overhead", case, overhead.TIME, 1.02)
+
+
+def _kinds_of_functions() -> Iterator[Budget]:
+    """Return the bounds of calls of other functions, to calls of an importable one."""
+    ours: Any = {"contender": "fiber-loopback"}
+    for kind in (throughput.OF_MAIN, throughput.BY_VALUE):
+        what = f"loopback: latency of one apply, {kind}, p50, to an importable one"
+        metric, case = latency.P50.name, f"apply, {kind}"
+        yield Budget(what, "latency", case, metric, 1.2, to_case=latency.NAME, **ours)
+        what = f"loopback: no-ops: apply_async, {kind}, to an importable one"
+        metric, case = throughput.RATE.name, f"apply_async, {kind}"
+        more: Any = {"to_case": "apply_async", "at_least": True, **ours}
+        yield Budget(what, "throughput", case, metric, 0.83, **more)
 
 
 def _endings() -> Iterator[Budget]:

@@ -28,7 +28,9 @@ def give_back(item: Any) -> Any:
 class Bench:
     """Contender's pool and context, with which a measure runs."""
 
+    no_op = staticmethod(no_op)
     of_main = staticmethod(give_back)
+    by_value = staticmethod(lambda item: item)
 
     def __init__(self, contender: str, *, light: bool) -> None:
         self.contender = contender

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
+from benchmarks import latency
 from benchmarks.model import WORKERS, Case, Metric
 from benchmarks.tasks import no_op, ones, size, sleep
 
@@ -16,7 +17,8 @@ if TYPE_CHECKING:
 TITLE = "Throughput"
 ABOUT = f"""\
 {WORKERS} workers. No-op tasks return their argument, an int. Their function is one of an importable
-module or, where the case says so, of the main module, as in most scripts. Contenders with servers
+module or, where the case says so, of the main module, as in most scripts, or a lambda, which
+travels by value, as the functions of a notebook do. Contenders with servers
 (Dask, ipyparallel, Ray, Spark) get a tenth of the no-op tasks, so that a round ends in bearable
 time. A batch of arrays has 100 different arrays of 1 MB, sent with chunksize 1.
 
@@ -31,6 +33,7 @@ ARRAYS = "arrays of 1 MB"
 LONG = "one long task"
 MEGABYTE = 1 << 20
 OF_MAIN = "function of __main__"
+BY_VALUE = "function by value"
 
 # Name, ability, method, chunk size, tasks.
 _NO_OPS: tuple[tuple[str, str, str, int | None, int], ...] = (
@@ -41,6 +44,7 @@ _NO_OPS: tuple[tuple[str, str, str, int | None, int], ...] = (
     ("apply_async", "submit", "submit", None, 10_000),
     (f"map, chunksize 1, {OF_MAIN}", "map", "map", 1, 10_000),
     (f"apply_async, {OF_MAIN}", "submit", "submit", None, 10_000),
+    (f"apply_async, {BY_VALUE}", "submit", "submit", None, 10_000),
 )
 ARRAY_KINDS = {
     "1 MB arguments": "arguments",
@@ -54,7 +58,8 @@ def cases(size: float) -> list[Case]:
     """Return the full measure at size 1; below, fewer tasks."""
 
     def case(name: str, group: str, needs: str, metric: Metric, **params: Any) -> Case:
-        return Case("throughput", name, group, needs, params, (metric,))
+        not_run = latency.NOT_BY_VALUE if name.endswith(BY_VALUE) else {}
+        return Case("throughput", name, group, needs, params, (metric,), not_run=not_run)
 
     return [
         *(
@@ -66,7 +71,7 @@ def cases(size: float) -> list[Case]:
                 kind=method,
                 tasks=max(100, round(tasks * size)),
                 chunksize=chunksize,
-                of_main=name.endswith(OF_MAIN),
+                function=_function_of(name),
             )
             for name, needs, method, chunksize, tasks in _NO_OPS
         ),
@@ -80,17 +85,23 @@ def cases(size: float) -> list[Case]:
     ]
 
 
+def _function_of(name: str) -> str:
+    """Return the name of the no-op of a case."""
+    if name.endswith(BY_VALUE):
+        return "by_value"
+    return "of_main" if name.endswith(OF_MAIN) else "no_op"
+
+
 def run(
-    bench: Bench, kind: str, tasks: int, chunksize: int | None, *, of_main: bool = False
+    bench: Bench, kind: str, tasks: int, chunksize: int | None, *, function: str = "no_op"
 ) -> dict[str, float]:
     """Return tasks a second for no-ops; for the others the seconds of the batch."""
     if kind == "long":
         return _long(bench, tasks)
     if kind in ARRAY_KINDS.values():
         return _arrays(bench, kind, tasks)
-    function = bench.of_main if of_main else no_op
     tasks = tasks if bench.light else max(100, tasks // 10)
-    return _no_ops(bench, kind, function, tasks, chunksize)
+    return _no_ops(bench, kind, getattr(bench, function), tasks, chunksize)
 
 
 def _no_ops(

@@ -272,6 +272,11 @@ def dumps(
     return _dump(_by_value_pickler(), obj, protocol, buffer_callback)
 
 
+def dumps_by_value(function: FunctionType) -> bytes:
+    """Pickle a function by value."""
+    return _dump(_by_value_pickler(), function)
+
+
 def encode(obj: Any) -> tuple[bytes, list[memoryview]]:
     """Pickle ``obj`` for a packet: the pickle, and large buffers beside it.
 
@@ -319,7 +324,7 @@ def main_is_out_of_reach() -> bool:
 
     They must if the readers of the pickles cannot import ``__main__``, or must not import it.
     """
-    if _readers_are_remote or "ps1" in vars(sys):  # an interactive session has no file
+    if _readers_lack_main or "ps1" in vars(sys):  # an interactive session has no file
         return True
     main = vars(sys.modules["__main__"])
     spec = main.get("__spec__")
@@ -337,13 +342,13 @@ def _importable(name: str | None, file: str | None) -> bool:
     return file is not None and os.path.isfile(os.path.join(started_in, file))
 
 
-def readers_are_remote(remote: bool) -> None:
-    """Note whether processes run on other hosts: if so, objects of ``__main__`` go by value."""
-    global _readers_are_remote
-    _readers_are_remote = remote
+def readers_lack_main(lack: bool) -> None:
+    """Note whether other processes lack the file of ``__main__``: if so, it goes by value."""
+    global _readers_lack_main
+    _readers_lack_main = lack
 
 
-_readers_are_remote = False
+_readers_lack_main = False
 
 
 class _Forking(ForkingPickler):

@@ -97,7 +97,9 @@ def test_children_import_the_program_without_its_guarded_part(
     programs: Programs, start: Callable[[Programs], str]
 ) -> None:
     output = start(programs)
-    assert output.replace("top level of __mp_main__\n", "") == ONCE + RESULT
+    imported = output.replace("top level of __mp_main__\n", "")
+    assert imported == ONCE + RESULT
+    assert output != imported
 
 
 @pytest.mark.timeout(LIMIT)
@@ -112,6 +114,44 @@ def test_functions_of_a_program_that_children_do_not_import_travel_by_value(
 def test_a_program_from_standard_input_needs_no_guard(tmp_path: Path) -> None:
     unguarded = DEFINITIONS + CALL
     assert Programs(tmp_path, "local").run(input=unguarded) == ONCE + RESULT
+
+
+GLOBALS = """\
+import fiber
+
+number, words = 1, ["one"]
+
+def read(calls=[]): calls.append(0); return number, words[-1], len(calls)
+
+def total(x): return x + number
+
+def rebind(f): f.extra = number; return f(1)
+
+with fiber.Pool(1) as pool, fiber.futures.ProcessPoolExecutor(1) as executor:
+    for changed in (1, 2, 1):
+        number = changed
+        words.append(str(changed))
+        print(pool.apply(read), pool.apply(total, (1,)), end=" ")
+        print(pool.apply_async(total, (2,)).get(), pool.map(total, [3]), end=" ")
+        print(executor.submit(total, 4).result(), pool.apply(rebind, (total,)))
+    class Count: step = 5
+    def total(x): return x + number + Count.step
+    print(pool.apply(total, (1,)))
+    Count.step = 6
+    print(pool.apply(total, (1,)), pool.map(total, [2]))
+"""
+"""Session that changes what its functions read."""
+
+
+@pytest.mark.timeout(LIMIT)
+def test_changes_of_a_sessions_globals_reach_its_workers(programs: Programs) -> None:
+    assert programs.run("-c", GLOBALS).splitlines() == [
+        "(1, '1', 1) 2 3 [4] 5 2",
+        "(2, '2', 1) 3 4 [5] 6 3",
+        "(1, '1', 1) 2 3 [4] 5 2",
+        "7",
+        "8 [9]",
+    ]
 
 
 @pytest.mark.timeout(LIMIT)

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from fiber._backends import program_layout
+from fiber._backends import main_module, program_layout
 from fiber._backends.program_layout import find_layout
 from unit.shipping_site import write
 
@@ -33,7 +33,8 @@ class Machine:
         monkeypatch.setattr(process, "ORIGINAL_DIR", str(self.es))
         # Without the modules that the tests themselves have imported from outside of site-packages.
         self.modules = {"__main__": self.main}
-        monkeypatch.setattr(program_layout, "sys", SimpleNamespace(modules=self.modules))
+        for module in (main_module, program_layout):
+            monkeypatch.setattr(module, "sys", SimpleNamespace(modules=self.modules))
         monkeypatch.setattr(tempfile, "tempdir", "/nowhere")  # ours is in that
 
     def runs(self, file: Path, name: str | None = None) -> None:
@@ -171,6 +172,15 @@ def test_only_imported_modules_of_a_home_directory_are_sent(machine: Machine) ->
     layout = machine.layout(machine.home, STDLIB, directory=machine.home)
     assert set(layout.places.values()) == {"program/train.py", "program/helper.py", "program/pkg"}
     assert layout.paths == (("program",), (), "program", "program/train.py")
+
+
+def test_a_module_with_an_empty_path_is_no_package(machine: Machine) -> None:
+    machine.runs(machine.es / "main.py")
+    (machine.lib / "six.py").touch()
+    machine.has_imported("six", machine.lib / "six.py")
+    machine.modules["six"].__path__ = []
+    layout = machine.layout(machine.es, machine.lib, STDLIB)
+    assert layout.places[str(machine.lib / "six.py")] == "program/six.py"
 
 
 def test_a_module_of_a_namespace_package_keeps_its_path(machine: Machine) -> None:

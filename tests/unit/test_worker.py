@@ -18,7 +18,8 @@ import numpy as np
 import pytest
 
 from fiber._agent import worker as worker_module
-from fiber._agent.worker import FUNCTIONS, BatchRunner, Watchdog
+from fiber._agent.by_value import FUNCTIONS
+from fiber._agent.worker import BatchRunner, Watchdog
 from fiber._wire import packet, work
 from patience import PATIENCE
 from processes import pool_tasks as tasks

@@ -284,12 +284,8 @@ def inheriting() -> Iterator[None]:
 
 
 def prepare_paths(data: dict[str, Any]) -> None:
-    """Make modules importable as in the parent, as far as its directories exist here."""
-    if data["same_host"] or "program" in data:
-        sys.path[:] = data["sys_path"]
-    else:
-        known = set(sys.path)
-        sys.path += [p for p in data["sys_path"] if p not in known and os.path.exists(p or ".")]
+    """Make modules importable as in the parent."""
+    sys.path[:] = data["sys_path"]
     sys.argv[:] = data["sys_argv"]
     # The parent's working directory may be removed, or forbidden for this process.
     with contextlib.suppress(OSError):

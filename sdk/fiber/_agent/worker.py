@@ -27,14 +27,12 @@ from typing import Any
 
 from fiber._agent import child
 from fiber._agent.batch_results import BatchResults, ResultChannel
+from fiber._agent.by_value import FUNCTIONS
 from fiber._agent.exception_pickles import encode_error, format_error
 from fiber._hub.remote import Taken, confirm, loads
 from fiber._wire import work
 from fiber._wire.packet import Message
 from fiber._worker_images import missing_module
-
-FUNCTIONS = 128
-"""Number of functions that a worker remembers."""
 
 SMALL = frozenset({int, float, bool, type(None)})
 """Types of values that a single call sends without BatchResults."""

@@ -26,7 +26,6 @@ import sysconfig
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from functools import lru_cache
-from multiprocessing import process as mp_process
 from typing import Any, NamedTuple
 
 from pathspec import GitIgnoreSpec
@@ -34,7 +33,7 @@ from pathspec.patterns.gitignore import GitIgnorePatternError
 from pathspec.patterns.gitignore.spec import GitIgnoreSpecPattern
 
 from fiber._agent.child import ProgramPaths
-from fiber._worker_images import INSTALLED
+from fiber._backends.main_module import is_inside, is_installed, main_file, started_in
 
 LOOSE = "program"
 """Folder on the other machine for modules that are sent without the folder around them."""
@@ -45,7 +44,7 @@ class Places(dict[str, str]):
 
     def place_of(self, path: str) -> str | None:
         """Return the place that is ``path`` or has it; None if there is none."""
-        return next((place for place in self if _is_inside(path, place)), None)
+        return next((place for place in self if is_inside(path, place)), None)
 
     def name_of(self, path: str) -> str | None:
         """Return the path on the other machine; None if ``path`` is not sent."""
@@ -125,7 +124,7 @@ def find_layout(
         _session(here).intersection(places) if main is None else frozenset(),
         ProgramPaths(
             *_search_path(places, path),
-            directory=(_is_inside(here, program_folder) and places.name_of(here))
+            directory=(is_inside(here, program_folder) and places.name_of(here))
             or places.name_of(program_folder)
             or LOOSE,
             main=None if main is None or not by_path else places.name_of(main),
@@ -133,23 +132,9 @@ def find_layout(
     )
 
 
-def main_file() -> str | None:
-    """Return the file of the main module; None if it is installed or has no file."""
-    path = getattr(sys.modules["__main__"], "__file__", None)
-    if path is None:
-        return None
-    path = os.path.abspath(os.path.join(_started_in(), path))
-    return path if os.path.isfile(path) and not _is_installed(path) else None
-
-
-def _started_in() -> str:
-    directory: str | None = mp_process.ORIGINAL_DIR  # type: ignore[attr-defined]
-    return directory or ""
-
-
 def _session(here: str) -> frozenset[str]:
     # An interactive interpreter has its first working directory on its path.
-    return frozenset({here, os.path.abspath(_started_in())})
+    return frozenset({here, os.path.abspath(started_in())})
 
 
 def _folder_of(main: str) -> str:
@@ -164,7 +149,7 @@ def _search_path(places: Places, path: list[str]) -> tuple[tuple[str, ...], tupl
     """Return the entries of the other machine's ``sys.path``, before and after the library."""
 
     def there(entries: list[str]) -> list[str]:
-        names = [places.name_of(entry) for entry in entries if not _is_installed(entry)]
+        names = [places.name_of(entry) for entry in entries if not is_installed(entry)]
         return [name for name in names if name is not None]
 
     library = sysconfig.get_path("stdlib")
@@ -180,35 +165,17 @@ def _is_offered(folder: str) -> bool:
 
 
 def _is_tree(folder: str, places: Places) -> bool:
-    return os.path.isdir(folder) and not _is_installed(folder) and places.name_of(folder) is None
+    return os.path.isdir(folder) and not is_installed(folder) and places.name_of(folder) is None
 
 
 def _is_sent(path: str) -> bool:
-    return os.path.exists(path) and not (_is_installed(path) or _is_shared(path))
-
-
-def _is_installed(path: str) -> bool:
-    if not set(INSTALLED).isdisjoint(path.split(os.sep)):
-        return True
-    return any(_is_inside(path, folder) for folder in _own_folders())
-
-
-@lru_cache(maxsize=1)
-def _own_folders() -> frozenset[str]:
-    """Return the folders of the interpreter, and that of Fiber."""
-    kinds = ("stdlib", "platstdlib", "scripts")
-    fiber = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
-    return frozenset({fiber, *map(sysconfig.get_path, kinds)})
+    return os.path.exists(path) and not (is_installed(path) or _is_shared(path))
 
 
 def _is_shared(folder: str) -> bool:
     """Return whether the folder has unrelated files, as a home folder does."""
     home, here = os.path.realpath(os.path.expanduser("~")), os.path.realpath(folder)
-    return _is_inside(home, here) or here == os.path.realpath(tempfile.gettempdir())
-
-
-def _is_inside(path: str, folder: str) -> bool:
-    return path == folder or path.startswith(folder.rstrip(os.sep) + os.sep)
+    return is_inside(home, here) or here == os.path.realpath(tempfile.gettempdir())
 
 
 def _outermost(paths: Iterable[str]) -> list[str]:
@@ -217,7 +184,7 @@ def _outermost(paths: Iterable[str]) -> list[str]:
     return [
         path
         for path in found
-        if not any(path != other and _is_inside(path, other) for other in found)
+        if not any(path != other and is_inside(path, other) for other in found)
     ]
 
 
@@ -240,24 +207,30 @@ def _imported(left_out: frozenset[str]) -> Iterator[_ImportedModule]:
         if name in ("__main__", "__mp_main__") or name.partition(".")[0] == "fiber_api":
             continue  # a part of Fiber
         file = getattr(module, "__dict__", {}).get("__file__")
-        if not isinstance(file, str) or _is_installed(file) or not os.path.isfile(file):
+        if not isinstance(file, str) or is_installed(file) or not os.path.isfile(file):
             continue
         package, *_ = parts = name.split(".")
         top = sys.modules.get(package, module)
-        if hasattr(top, "__path__") and getattr(top, "__file__", None):
-            yield _ImportedModule(file, next(iter(top.__path__)), package)
+        folder = next(iter(_search_path_of(top)), None)
+        if folder is not None and getattr(top, "__file__", None):
+            yield _ImportedModule(file, folder, package)
         elif portion := _portion(top, file, left_out):
             yield _ImportedModule(file, portion, package)
         else:  # of a namespace package, whose folder may have unrelated files
-            if not hasattr(module, "__path__"):
+            if not _search_path_of(module):
                 parts.pop()
             yield _ImportedModule(file, file, os.path.join(*parts, os.path.basename(file)))
+
+
+def _search_path_of(module: Any) -> list[str]:
+    """Return the folders of a package.  A module may have an empty ``__path__``, as six has."""
+    return list(getattr(module, "__path__", ()))
 
 
 def _portion(package: Any, file: str, left_out: frozenset[str]) -> str | None:
     """Return the folder of a namespace package with ``file``; None if it may have others."""
     folders = (os.path.abspath(folder) for folder in getattr(package, "__path__", ()))
-    folder = next((folder for folder in folders if _is_inside(file, folder)), None)
+    folder = next((folder for folder in folders if is_inside(file, folder)), None)
     if folder is None:
         return None
     around = os.path.dirname(folder)

@@ -20,8 +20,9 @@ from typing import Any, NamedTuple
 
 from fiber._agent.child import ProgramPaths
 from fiber._backends import program_files
+from fiber._backends.main_module import main_file
 from fiber._backends.program_files import FileEntry, UnsentFile, Why, select
-from fiber._backends.program_layout import INCLUDING, Layout, find_layout, main_file
+from fiber._backends.program_layout import INCLUDING, Layout, find_layout
 from fiber._wire.memory_files import Blob
 from fiber.errors import ProgramTooLarge, in_one_line
 
@@ -45,11 +46,6 @@ class Shipping:
         self._warned: set[str] = set()
         """Warnings that were given, and the paths in them."""
 
-    @property
-    def main_is_sent(self) -> bool:
-        """True if children can import the main module."""
-        return main_file() is not None
-
     def program(self, preparation: Mapping[str, Any], *, anew: bool) -> PackedProgram:
         """Return the program for children that are prepared by ``preparation``; ProgramTooLarge.
 
@@ -61,7 +57,7 @@ class Shipping:
 
     def _pack(self, preparation: Mapping[str, Any]) -> tuple[dict[str, FileEntry], PackedProgram]:
         layout = find_layout(preparation, self._left_out)
-        if self.main_is_sent and layout.places.place_of(layout.program) is None:
+        if main_file() is not None and layout.places.place_of(layout.program) is None:
             self._warn(
                 f"the program is in {layout.program!r}, a folder with unrelated files: workers on "
                 "other machines get only the modules that it has imported. Move the program to a "

@@ -189,7 +189,7 @@ class PoolExecutor:
         queue: CallQueue | None = None,
     ) -> None:
         """Submit a call.  The calls of a ``queue`` share options; ``timeout`` is for this one."""
-        call = pickle_call(future, function, args, kwargs, self.reject)
+        call = pickle_call(self._functions, future, function, args, kwargs, self.reject)
         if call is None:
             return
         self._check()
@@ -206,7 +206,9 @@ class PoolExecutor:
     ) -> Any:
         """Submit a call and wait for it; return its result or raise its exception."""
         direct = timeout is None and self._leases_workers
-        call = pickle_call(future, function, args, kwargs, self.reject, blocking=direct)
+        call = pickle_call(
+            self._functions, future, function, args, kwargs, self.reject, blocking=direct
+        )
         if call is None:
             return future.get()
         self._check()
@@ -231,7 +233,7 @@ class PoolExecutor:
         self, future: TaskFuture, function: Callable[..., Any], args: Sequence[Any]
     ) -> None:
         """Submit a call to every worker, ready or starting; ``future`` gets an outcome of each."""
-        call = pickle_call(future, function, args, {}, self.reject)
+        call = pickle_call(self._functions, future, function, args, {}, self.reject)
         if call is not None:
             self._check()
             self._loop.call_soon(self._broadcast, WorkItem(work.CALLS, future=future), call)

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 from fiber import _config_sources, _logs, config, reduction
 from fiber._agent import child
 from fiber._agent.interface import ChildHandle, ChildSpec
+from fiber._backends.main_module import main_file
 from fiber._engine.activity import Activity
 from fiber._hub import client as hub_client
 from fiber._hub.handles import collecting_grants
@@ -81,10 +82,7 @@ class Runtime:
             self.hub = self._make_hub()
             self.backend: Backend = _make_backend(self)
             self._shipping = _make_shipping(self.backend)
-            reduction.readers_are_remote(
-                not self.backend.same_host
-                and not (self._shipping is not None and self._shipping.main_is_sent)
-            )
+            reduction.readers_lack_main(not self.backend.same_host and main_file() is None)
             self.loop.start_thread("fiber-io")
             self._serve_metrics()
             _logs.debug("%s on host %s", type(self.backend).__name__, self.host)
@@ -246,7 +244,6 @@ class Runtime:
     def _preparation(self, process: Any, *, anew: bool) -> tuple[bytes, PackedProgram | None]:
         """Return the preparation data of a child, and its files; ``anew`` as in ``Shipping``."""
         data = self._spawn_data(f"process {process.name!r}")
-        same_host = self.backend.same_host
         data["authkey"] = bytes(data["authkey"])
         # A child's children run on its host.
         data["calls"] = [
@@ -255,14 +252,11 @@ class Runtime:
             *self._record_calls(),
             *self._output_calls(),
         ]
-        data["same_host"] = same_host
-        if same_host:
+        if self.backend.same_host:
             data["environ"] = dict(os.environb)
             data["preload"] = [*start_methods.preload, *_modules_of(process)]
-        elif self._shipping is not None:
-            data["preload"] = ["cloudpickle", *start_methods.preload, *_modules_of(process)]
         else:
-            data["preload"] = ["cloudpickle"]
+            data["preload"] = ["cloudpickle", *start_methods.preload, *_modules_of(process)]
         program = None
         if self._shipping is not None:
             program = self._shipping.program(data, anew=anew)

@@ -15,15 +15,14 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Protocol
 
 from fiber import reduction
+from fiber._agent.by_value import FUNCTIONS
 from fiber._engine.chunks import TaskPace
 from fiber._engine.tasks import Job, Limits
 from fiber._hub.handles import GrantSet
+from fiber._runtime.by_value import FunctionPickles
 from fiber._runtime.threads import check_may_wait
 from fiber._transport.loop import DOZE
 from fiber._wire import packet, work
-
-FUNCTIONS = 128
-"""Number of functions whose pickles a FunctionCache keeps."""
 
 FUNCTION_SIZE = 1 << 16
 """Largest pickle, in bytes, that a FunctionCache keeps."""
@@ -64,13 +63,14 @@ class FunctionCache:
     """Recognizes functions by their pickles.  Runs on any thread."""
 
     def __init__(self) -> None:
+        self._by_value = FunctionPickles()
         self._known: dict[bytes, Function] = {}
         self._ids = itertools.count(1)
 
     def get(self, function: Callable[..., Any]) -> Function:
         """Return ``function``, pickled.  Equal pickles are the same Function."""
         try:
-            data, buffers, grants = reduction.encode_reusable(function)
+            data, buffers, grants = reduction.encode_reusable(self.light(function))
         except reduction.REFUSALS as error:
             what = f"the function {name_of(function)}"
             raise reduction.blame({what: function}, error) from error
@@ -84,6 +84,10 @@ class FunctionCache:
                 self._known.clear()  # in one step, as several threads may call this
             self._known[data] = made
         return made
+
+    def light(self, function: Callable[..., Any]) -> Any:
+        """Return what to pickle in place of ``function``; see ``FunctionPickles``."""
+        return self._by_value.light(function)
 
 
 class InputStream:
@@ -348,6 +352,7 @@ class WorkItem:
 
 
 def pickle_call(
+    functions: FunctionCache,
     future: TaskFuture,
     function: Callable[..., Any],
     args: Iterable[Any],
@@ -358,9 +363,10 @@ def pickle_call(
 ) -> Call | None:
     """Pickle a call; if that fails, pass the error to ``reject`` and return None."""
     try:
-        data, buffers, grants = reduction.encode_reusable((function, args, kwargs))
+        call = functions.light(function), args, kwargs
+        data, buffers, grants = reduction.encode_reusable(call)
         if len(buffers) > work.BUFFERS:
-            data, buffers = reduction.dumps((function, args, kwargs), 5), []
+            data, buffers = reduction.dumps(call, 5), []
     except Exception as error:
         reject(future, _blame_call(function, args, kwargs, error))
         return None
