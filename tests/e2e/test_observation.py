@@ -5,6 +5,10 @@ from __future__ import annotations
 import asyncio
 import json
 import re
+import signal
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -62,7 +66,7 @@ async def last_update(address: str, deaths: int) -> dict[str, Any]:
         async with client.get(address) as response:
             assert response.status == 200
         async with client.ws_connect(f"{origin}/feed", headers={"Origin": origin}) as feed:
-            while len(merged.get("state", {}).get("deaths", ())) < deaths:
+            while "state" not in merged or len(merged["state"]["deaths"]) < deaths:
                 merged |= json.loads(await feed.receive_str(timeout=PATIENCE))
     return merged
 
@@ -90,30 +94,51 @@ def pod_monitor() -> Body:
     return monitor
 
 
-def test_a_program_in_a_pod_is_seen_in_its_page_and_its_metrics(
-    person: Person, cluster: Cluster
-) -> None:
-    scene = person.scene
+@pytest.fixture
+def run(person: Person) -> Iterator[subprocess.Popen[str]]:
+    """A program in a pod, which serves metrics and waits with two tasks."""
     variables = ("--env", "FIBER_METRICS_PORT=9100", "--env", "FIBER_METRICS_HOST=0.0.0.0")
-    words = ("run", "--service-account", ACCOUNT, "--name", "mine", *variables, "observed.py")
-    with person.start(*words) as run:
+    words = ("run", "--service-account", ACCOUNT, "--name", "mine", *variables)
+    with ending(person.start(*words, "observed.py", "--stay")) as run:
         assert run.stdout is not None
         assert json.loads(run.stdout.readline())["total"] == 9900
-        with person.start("dashboard", "mine", "--no-open") as dashboard:
-            assert dashboard.stdout is not None
-            found = ADDRESS.search(dashboard.stdout.readline())
-            assert found is not None
-            before = asyncio.run(last_update(found[0], deaths=0))
-            pod = scene.now["pods"][person.pod("mine")]
-            scraped = metrics_of(scene, pod)
-            victims = worker_pods(scene)
-            for pod in victims:
-                cluster.kill(pod, names.WORKER_CONTAINER)
-            after = asyncio.run(last_update(found[0], deaths=len(victims)))
-            dashboard.terminate()
-            dashboard.communicate(timeout=PATIENCE)
-        output, errors = run.communicate(timeout=PATIENCE)
+        yield run
+
+
+@pytest.fixture
+def page(person: Person, run: subprocess.Popen[str]) -> Iterator[str]:
+    """Address of the program's page."""
+    with ending(person.start("dashboard", "mine", "--no-open")) as dashboard:
+        assert dashboard.stdout is not None
+        found = ADDRESS.search(dashboard.stdout.readline())
+        assert found is not None
+        yield found[0]
+
+
+@contextmanager
+def ending(command: subprocess.Popen[str]) -> Iterator[subprocess.Popen[str]]:
+    """Terminate a command at the end, also if the test has failed."""
+    with command:
+        try:
+            yield command
+        finally:
+            command.terminate()
+
+
+def test_a_program_in_a_pod_is_seen_in_its_page_and_its_metrics(
+    person: Person, run: subprocess.Popen[str], page: str, cluster: Cluster
+) -> None:
+    scene = person.scene
+    before = asyncio.run(last_update(page, deaths=0))
+    scraped = metrics_of(scene, scene.now["pods"][person.pod("mine")])
+    victims = worker_pods(scene)
+    for pod in victims:
+        cluster.kill(pod, names.WORKER_CONTAINER)
+    after = asyncio.run(last_update(page, deaths=len(victims)))
+    run.send_signal(signal.SIGINT)
+    output, errors = run.communicate(timeout=PATIENCE)
     assert run.returncode == 0, errors
+    assert json.loads(output)["event"] == "left"
     hosts = {pod["metadata"]["name"] for pod in victims}
     assert {child["host"] for child in before["state"]["children"]} == hosts
     assert before["activity"]["tasks"] == scraped["fiber_program_tasks_done_total"] == 100
@@ -121,7 +146,6 @@ def test_a_program_in_a_pod_is_seen_in_its_page_and_its_metrics(
     deaths = after["state"]["deaths"]
     assert {death["host"] for death in deaths} == hosts
     assert all("137" in death["reason"] or "SIGKILL" in death["reason"] for death in deaths), deaths
-    assert json.loads(output)["event"] == "left"
 
 
 def test_the_timeline_shows_pods_and_their_ends(

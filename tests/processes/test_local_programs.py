@@ -128,10 +128,11 @@ def test_a_stopped_program_is_listed_as_silent(
     program: Program, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("fiber._cli.local._PATIENCE", 0.05)
+    name = name_of(program)
     os.kill(program.pid, signal.SIGSTOP)
     try:
         (row,) = json.loads(run("ps", "--output", "json").out)
-        assert (row["state"], row["pid"]) == ("silent", program.pid)
+        assert (row["state"], row["name"], row["pid"]) == ("silent", name, program.pid)
     finally:
         os.kill(program.pid, signal.SIGCONT)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import http.client
 import os
 import signal
@@ -248,9 +249,19 @@ def test_an_error_of_the_page_is_an_answer() -> None:
 
 def test_a_silent_client_does_not_delay_the_end(server: MetricsServer) -> None:
     with connect(server):
-        assert wait_until(lambda: server._client is not None, PATIENCE)
+        assert wait_until(lambda: bool(server._clients), PATIENCE)
         server.close()
         assert not server._thread.is_alive()
+        assert not server._clients
+
+
+def test_silent_clients_do_not_keep_a_scraper_waiting(server: MetricsServer) -> None:
+    with contextlib.ExitStack() as strangers:
+        for _ in range(2 * metrics._MOST_CLIENTS):
+            strangers.enter_context(connect(server))
+        assert get(server.url) in ("identity.", ".")
+        # Fewer than all: the first strangers were sent away.
+        assert wait_until(lambda: len(server._clients) <= metrics._MOST_CLIENTS, PATIENCE)
 
 
 def test_names_of_functions_are_text() -> None:

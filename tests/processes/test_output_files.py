@@ -20,7 +20,7 @@ import fiber
 from census import wait_until
 from faults.program import LOOPBACK, Program
 from faults.runtime import BACKENDS, running
-from fiber._agent.output_tee import TeeStream
+from fiber._agent.output_tee import TeeFile, TeeStream
 from fiber._output_files import (
     OutputFile,
     OutputKeeper,
@@ -51,6 +51,11 @@ def say(*texts: str) -> None:
 
 def say_and_die() -> None:
     print("the last words")
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def say_without_an_end() -> None:
+    print("the last words", end="", flush=True)
     os.kill(os.getpid(), signal.SIGKILL)
 
 
@@ -109,6 +114,11 @@ def test_each_worker_has_a_file_from_its_first_line_on(folder: Path) -> None:
 def test_the_lines_of_a_killed_child_are_there(folder: Path) -> None:
     assert run(say_and_die).exitcode == -signal.SIGKILL
     wait_for(folder, "one", "the last words\n")
+
+
+def test_the_last_line_of_a_killed_child_is_there_without_its_end(folder: Path) -> None:
+    assert run(say_without_an_end).exitcode == -signal.SIGKILL
+    assert wait_until(lambda: raw(folder, "one").rstrip() == "the last words", PATIENCE)
 
 
 def test_children_of_one_name_have_separate_files(folder: Path) -> None:
@@ -230,27 +240,33 @@ def test_a_full_disk_costs_only_the_lines_of_the_file(
     pipe_ends: tuple[int, int], tmp_path: Path
 ) -> None:
     reader, writer = pipe_ends
-    tee = TeeStream(writer, "<stdout>", Full(str(tmp_path), "p", "c"))
+    tee = TeeStream(writer, "<stdout>", TeeFile(Full(str(tmp_path), "p", "c")))
     with io.TextIOWrapper(io.BufferedWriter(tee)) as stream:
         print("seen", file=stream, flush=True)
     assert os.read(reader, 100) == b"seen\n"
 
 
-def test_lines_are_whole_and_long_ones_come_in_pieces(
-    pipe_ends: tuple[int, int], tmp_path: Path
-) -> None:
-    reader, writer = pipe_ends
-    tee = TeeStream(writer, "<stdout>", OutputFile(str(tmp_path), "p", "c"))
+def test_a_file_has_at_once_what_is_written(pipe_ends: tuple[int, int], tmp_path: Path) -> None:
+    _, writer = pipe_ends
+    tee = TeeStream(writer, "<stdout>", TeeFile(OutputFile(str(tmp_path), "p", "c")))
     tee.write(b"a beginning")
-    assert os.listdir(tmp_path) == []
+    assert (tmp_path / "p.c.log").read_bytes() == b"a beginning"
     tee.write(b", an end\nand")
-    assert (tmp_path / "p.c.log").read_bytes() == b"a beginning, an end\n"
-    for _ in range(5):
-        tee.write(b"x" * 16384)
-        os.read(reader, 1 << 16)
-    assert (tmp_path / "p.c.log").read_bytes().count(b"x") == 4 * 16384
     tee.finish(io.StringIO())
-    assert (tmp_path / "p.c.log").read_bytes().endswith(b"x" * 16384 + b"\n")
+    assert (tmp_path / "p.c.log").read_bytes() == b"a beginning, an end\nand\n"
+
+
+def test_two_streams_share_no_line(pipe_ends: tuple[int, int], tmp_path: Path) -> None:
+    _, writer = pipe_ends
+    file = TeeFile(OutputFile(str(tmp_path), "p", "c"), times=True)
+    output, errors = (TeeStream(writer, name, file) for name in ("<stdout>", "<stderr>"))
+    output.write(b"one, ")
+    output.write(b"two")
+    errors.write(b"an error\n")
+    output.write(b"\xff three\nfour\n")
+    lines = (tmp_path / "p.c.log").read_bytes().splitlines()
+    assert [line[24:] for line in lines] == [b"one, two", b"an error", b"\xff three", b"four"]
+    assert all(re.fullmatch(TIME, line[:23].decode()) for line in lines)
 
 
 def test_the_first_error_of_the_keeper_is_told(tmp_path: Path) -> None:

@@ -164,6 +164,17 @@ def test_the_summary_of_a_pool(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("backend")
+@pytest.mark.usefixtures("backend")
+def test_each_apply_counts_at_once_and_for_its_function() -> None:
+    with fiber.Pool(2) as pool:
+        for number in range(50):
+            pool.apply(oct, (number,))
+            pool.apply(hex, (number,))
+        found = fiber.summary()
+    tasks = {one.name: one.tasks for one in found.functions}
+    assert (tasks["oct"], tasks["hex"]) == (50, 50)
+
+
 def test_a_task_that_runs_counts_before_its_answer() -> None:
     with fiber.Pool(1) as pool:
         pool.apply(work, (0,))

@@ -488,7 +488,7 @@ parent = os.environ.get("FIBER_RUNTIME_DIRECTORY") or os.environ["TMPDIR"]
 folder = parent + "/fiber-watched"
 os.mkdir(folder, 0o700)
 loop = Loop()
-server = MonitorServer(loop, folder, lambda request: [{"answer": request}])
+server = MonitorServer(loop, folder, "watched", lambda request: [{"answer": request}])
 print("listens", flush=True)
 loop.run()
 """

@@ -30,7 +30,7 @@ def folder(tmp_path: Path) -> Path:
 @pytest.fixture
 def listening(loop: Loop, folder: Path) -> Iterator[str]:
     """The socket of a server that repeats the request."""
-    made = MonitorServer(loop, str(folder), lambda request: [request])
+    made = MonitorServer(loop, str(folder), "train-1", lambda request: [request])
     yield str(folder / server.SOCKET)
     close(loop, made)
 
@@ -121,7 +121,7 @@ def test_a_socket_has_its_name_once_it_listens(
             super().listen(*args)
 
     monkeypatch.setattr(socket, "socket", Listener)
-    made = MonitorServer(loop, str(folder), lambda request: [request])
+    made = MonitorServer(loop, str(folder), "train-1", lambda request: [request])
     assert seen == [[]]
     assert client.sockets(str(folder.parent)) == [str(folder / server.SOCKET)]
     close(loop, made)

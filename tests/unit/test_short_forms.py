@@ -48,7 +48,10 @@ def call(*args: Any, **kwargs: Any) -> str:
         ((np.zeros(3),), {}, "<numpy object>"),
         ((np.zeros(100_000),), {}, "<numpy object>"),
         (tuple(range(8)), {}, "0, 1, 2, 3, 4, 5, ..."),
-        ((10**5000,), {}, ""),
+        ((10**5000,), {}, "<int of 16,610 bits>"),
+        (([[[[1]]]],), {}, "[[[[1]]]]"),
+        (((1,),), {}, "(1,)"),
+        (({"a": {1}},), {}, "{'a': {1}}"),
         (("x" * 10_000,), {}, ""),
     ],
 )
@@ -57,7 +60,34 @@ def test_arguments_of_a_call(args: Any, kwargs: Any, form: str) -> None:
 
 
 def test_a_long_argument_is_shortened() -> None:
-    assert len(call("x" * 3000)) < 40
+    assert call("x" * 3000) == repr("x" * 40) + "..."
+
+
+def test_shared_lists_take_no_longer_than_others() -> None:
+    shared: Any = list("abcdef")
+    for _ in range(30):
+        shared = [shared] * 6
+    assert len(call(*[shared] * 6)) < 300
+
+
+def test_of_a_long_list_few_items_are_looked_at() -> None:
+    class Items(list[int]):
+        def __iter__(self) -> Any:
+            raise AssertionError("the user's code ran")
+
+    assert short_form(list(range(10**6))) == "[0, 1, 2, 3, 4, 5, ...]"
+    assert short_form(Items([1])) == "<Items>"
+
+
+def test_a_class_is_shown_by_its_name() -> None:
+    class Named(type):
+        @property
+        def __name__(cls) -> str:  # type: ignore[override]
+            raise AssertionError("the user's code ran")
+
+    made = Named("Made", (), {})
+    assert short_form(made) == "Made"
+    assert short_form(made()) == "<Made>"
 
 
 def test_what_is_no_pickle_has_no_short_form() -> None:
@@ -67,5 +97,5 @@ def test_what_is_no_pickle_has_no_short_form() -> None:
 
 def test_items_of_a_map() -> None:
     assert short_form((1, "two")) == "(1, 'two')"
-    assert short_form(Point(1, 2)) == ""
-    assert short_form(10**5000) == ""
+    assert short_form(Point(1, 2)) == "<Point>"
+    assert short_form(1 << 1_000_000) == "<int of 1,000,001 bits>"

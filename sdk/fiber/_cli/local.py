@@ -104,16 +104,8 @@ def _program(path: str) -> LocalProgram | None:
     pid = client.pid_of(path)
     if pid is None:
         return None
-    facts = {"name": f"{_comm(pid)}-{pid}", "pid": pid}
+    facts = {"name": client.name_of(path) or f"program-{pid}", "pid": pid}
     return LocalProgram(path, facts, answers=False)
-
-
-def _comm(pid: int) -> str:
-    try:
-        with open(f"/proc/{pid}/comm") as file:
-            return file.read().strip().lower()
-    except OSError:
-        return "program"
 
 
 def end(program: LocalProgram, *, now: bool) -> None:

@@ -10,9 +10,10 @@ to each other become one.  So a run of a minute shows each message, and a run of
 
 from __future__ import annotations
 
+import weakref
 from collections import deque
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 SPANS = 20_000
 """Spans that are kept."""
@@ -182,6 +183,13 @@ class WorkReport(NamedTuple):
     """Tasks that had to stay together, by the ``chunksize`` of a map."""
 
 
+class WorkSource(Protocol):
+    """Part of the program that notes work now and then."""
+
+    def note_work(self) -> None:
+        """Note all work until now."""
+
+
 class Activity:
     """Record of a program's children and their work."""
 
@@ -204,6 +212,8 @@ class Activity:
         """Children whose records were dropped."""
         self.deaths: deque[ChildRecord] = deque(maxlen=DEATHS)
         """Last children that ended, and that the program had not asked to end."""
+        self.sources: weakref.WeakSet[WorkSource] = weakref.WeakSet()
+        """Parts that note their work in ``refresh``."""
         self._most_spans = spans
         self._span_count = 0
         self._children: dict[int, ChildRecord] = {}
@@ -340,6 +350,11 @@ class Activity:
             "bytes_sent": self.bytes_sent,
             "bytes_received": self.bytes_received,
         }
+
+    def refresh(self) -> None:
+        """Have all sources note their work until now."""
+        for source in list(self.sources):
+            source.note_work()
 
     def snapshot(self, now: float, since: int = 0) -> dict[str, Any]:
         """Return the record as plain values, or what changed after the snapshot ``since``.

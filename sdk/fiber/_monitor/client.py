@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from fiber._hub.directory import HUB_SOCKET, remove_directory
-from fiber._monitor.server import PEER, SOCKET
+from fiber._monitor.server import NAME, PEER, SOCKET
 
 PATIENCE = 10.0
 """Seconds that a program may take for a part of its answer."""
@@ -80,6 +80,15 @@ def pid_of(path: str) -> int | None:
             return None
         credentials = sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, PEER.size)
         return int(PEER.unpack(credentials)[0])
+
+
+def name_of(path: str) -> str | None:
+    """Return the name of the program whose socket this is; None if it is not known."""
+    try:
+        with open(os.path.join(os.path.dirname(path), NAME), encoding="utf-8") as file:
+            return file.read() or None
+    except (OSError, ValueError):
+        return None
 
 
 def _is_mine(path: str) -> bool:

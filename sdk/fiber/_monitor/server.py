@@ -22,6 +22,9 @@ from fiber._transport.loop import Loop
 SOCKET = "monitor"
 """Name of the socket in the program's directory."""
 
+NAME = "name"
+"""Name of the file beside it that has the program's name, for a program that does not answer."""
+
 _UNFINISHED = "mon"
 """Name of the socket until it listens; short, as paths of sockets are."""
 
@@ -47,12 +50,14 @@ Answer = Callable[[dict[str, Any]], Iterable[AnswerLines]]
 class MonitorServer:
     """Server of one program.  ``answer`` runs on a thread for each client."""
 
-    def __init__(self, loop: Loop, directory: str, answer: Answer) -> None:
+    def __init__(self, loop: Loop, directory: str, name: str, answer: Answer) -> None:
         """Listen in ``directory``; OSError if that is not possible.  Any thread."""
         self._loop = loop
         self._answer = answer
         self._clients: set[socket.socket] = set()
         self.path = os.path.join(directory, SOCKET)
+        with open(os.path.join(directory, NAME), "w", encoding="utf-8") as file:
+            file.write(name)
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
         try:
             self._listen(os.path.join(directory, _UNFINISHED))

@@ -52,6 +52,7 @@ def snapshot(activity: Activity, children: Children, now: float, since: int = 0)
     ``busy``   pairs for the children with tasks that they have not answered: ``id``, and time since
     when, in seconds after the beginning
     """
+    activity.refresh()
     busy = []
     for child in children:
         record, busy_since = child.owner.record, child.owner.busy_since

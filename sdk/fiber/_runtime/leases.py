@@ -25,7 +25,7 @@ from collections.abc import Callable
 from typing import Any
 
 from fiber._agent.interface import DirectChannel, ExitReport
-from fiber._engine.activity import WorkReport
+from fiber._engine.activity import FUNCTIONS, OTHER_FUNCTIONS, WorkReport
 from fiber._engine.scheduler import Scheduler
 from fiber._engine.tasks import WrongAnswer
 from fiber._runtime.answers import OTHER, MessageFields, is_failure, read, single
@@ -57,33 +57,48 @@ ADOPTED = NoOutcome()
 """The loop has taken over, and sets the outcome of the call's future."""
 
 
+class CallCounts:
+    """Calls of one function that a leased worker answered.
+
+    Only the caller writes to ``calls``, ``failed`` and ``seconds``, and the loop reads them.
+    """
+
+    __slots__ = ("calls", "failed", "noted", "seconds")
+
+    def __init__(self) -> None:
+        self.calls = self.failed = 0
+        self.seconds = 0.0
+        """Seconds of work for these calls."""
+        self.noted = (0, 0, 0.0)
+        """``calls``, ``failed`` and ``seconds`` at the last note."""
+
+    def since_note(self) -> tuple[int, int, float]:
+        """Return the calls, failed calls and seconds since the last note, and note them."""
+        before, self.noted = self.noted, (self.calls, self.failed, self.seconds)
+        calls, failed, seconds = self.noted
+        return calls - before[0], failed - before[1], seconds - before[2]
+
+
 class LeasedWorker:
     """Record of a leased worker while a caller uses it.  Only ``Leases`` changes it."""
 
     __slots__ = (
+        "_functions",
+        "_noted",
         "answer",
-        "calls",
         "draining",
-        "failed",
-        "function",
         "handle",
-        "noted",
         "report",
-        "seconds",
         "seq",
         "unread",
     )
 
     def __init__(self, handle: WorkerHandle, now: float) -> None:
         self.handle = handle
-        self.function = ""
-        """Function of the last call that it answered."""
-        self.calls = self.failed = 0
-        """Calls that it answered.  Only the caller writes to these, and the loop reads them."""
-        self.seconds = 0.0
-        """Seconds of work for these calls."""
-        self.noted = (now, 0, 0, 0.0)
-        """Time of the last note; then ``calls``, ``failed`` and ``seconds`` at that time."""
+        self._functions: dict[str, CallCounts] = {}
+        """Calls that it answered, by their function.  The caller adds functions."""
+        self._noted = now
+        """Time of the last note of its work."""
         self.seq = 0
         """Number of the last call that a caller sent it."""
         self.answer: MessageFields | None = None
@@ -98,21 +113,33 @@ class LeasedWorker:
     def did(self, function: str, seconds: float, failed: bool) -> None:
         """Count a call that it has answered.  Runs on the caller's thread."""
         self.handle.did(1)
-        self.function = function
-        self.seconds += seconds
-        self.failed += failed
-        self.calls += 1
+        counts = self._functions.get(function)
+        if counts is None:
+            name = function if len(self._functions) < FUNCTIONS else OTHER_FUNCTIONS
+            counts = self._functions.setdefault(name, CallCounts())
+        counts.seconds += seconds
+        counts.failed += failed
+        counts.calls += 1
 
-    def take_work(self, now: float) -> WorkReport | None:
-        """Return the work since the last note, and note it; None if there was none."""
-        before, calls_before, failed_before, seconds_before = self.noted
-        calls, failed, seconds = self.calls, self.failed, self.seconds
-        if calls == calls_before:
-            return None
-        self.noted = now, calls, failed, seconds
-        work, tasks = seconds - seconds_before, calls - calls_before
-        begin = max(before, min(now - work, now - UNUSED))
-        return WorkReport(self.function, begin, now, work, tasks, failed - failed_before, tasks)
+    def take_work(self, now: float) -> list[WorkReport]:
+        """Return the work since the last note, a report for each function, and note it.
+
+        The calls of several functions may have been in any order.  Their reports follow each
+        other, and each has a share of the time as it has of the work.
+        """
+        taken = [(name, *counts.since_note()) for name, counts in list(self._functions.items())]
+        taken = [each for each in taken if each[1]]
+        if not taken:
+            return []
+        work = sum(seconds for *_, seconds in taken)
+        begin = max(self._noted, min(now - work, now - UNUSED))
+        length, self._noted = now - begin, now
+        reports = []
+        for name, calls, failed, seconds in taken:
+            end = begin + length * (seconds / work if work else 1 / len(taken))
+            reports.append(WorkReport(name, begin, end, seconds, calls, failed, calls))
+            begin = end
+        return reports
 
 
 class Lease:
@@ -235,6 +262,7 @@ class Leases:
         self._recalled = False
         self._idle.append(lease)
         if self._check is None:
+            self._activity.notes_of(self)
             self._check = self._loop.call_later(UNUSED, self._recall_unused)
 
     def recall(self) -> None:
@@ -300,8 +328,7 @@ class Leases:
     def _recall_unused(self) -> None:
         """End the leases that no caller used since this was called last."""
         self._check = None
-        for worker in self._leases.values():
-            self._note(worker)
+        self.note_work()
         for lease in list(self._idle):
             if not lease.used:
                 self._recall_one(lease.worker.handle)
@@ -360,9 +387,13 @@ class Leases:
 
     def _note(self, worker: LeasedWorker) -> None:
         """Note the calls of a leased worker in the pool's activity."""
-        work = worker.take_work(self._loop.now())
-        if work is not None:
-            self._activity.leased(worker.handle, work)
+        for report in worker.take_work(self._loop.now()):
+            self._activity.leased(worker.handle, report)
+
+    def note_work(self) -> None:
+        """Note the calls of all leased workers until now."""
+        for worker in self._leases.values():
+            self._note(worker)
 
     def _back(self, worker: LeasedWorker) -> None:
         self._note(worker)

@@ -41,6 +41,8 @@ _PATIENCE = 2.0
 _SENDING = 5.0
 """Seconds that a client may take to read the page."""
 _BACKLOG = 16
+_MOST_CLIENTS = 8
+"""Clients at a time.  One more takes the place of the oldest, which may be silent."""
 
 
 class ProgramSample(NamedTuple):
@@ -79,6 +81,7 @@ def take_sample(
     activity: Activity, children: Children, pools: Iterable[WatchedPool], now: float
 ) -> ProgramSample:
     """Return the numbers of the program.  Runs on the loop thread."""
+    activity.refresh()
     workers: Counter[str] = Counter()
     waiting = held = 0
     for pool in list(pools):
@@ -211,7 +214,8 @@ class MetricsServer:
 
     def __init__(self, host: str, port: int, page: Callable[[str], tuple[str, bytes]]) -> None:
         self._page = page
-        self._client: socket.socket | None = None
+        self._clients: dict[threading.Thread, socket.socket] = {}
+        """Threads that answer clients, the oldest first."""
         self._closed = False
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         self._listener = socket.create_server(cast("Any", address), family=family, backlog=_BACKLOG)
@@ -226,20 +230,20 @@ class MetricsServer:
             raise
 
     def close(self) -> None:
-        """Refuse clients, and end the thread."""
+        """Refuse clients, and end the threads."""
         self._closed = True
-        for sock in (self._listener, self._client):
-            if sock is not None:
-                with contextlib.suppress(OSError):
-                    sock.shutdown(socket.SHUT_RDWR)  # it wakes the thread
+        _shut_down(self._listener)  # it wakes the thread
         self._thread.join(timeout=_PATIENCE)
+        for thread, client in list(self._clients.items()):
+            _shut_down(client)
+            thread.join(timeout=_PATIENCE)
         self._listener.close()
 
     def forget(self) -> None:
         """Close this process's copies of the sockets, after a fork."""
         self._listener.close()
-        if self._client is not None:
-            self._client.close()
+        for client in list(self._clients.values()):
+            client.close()
 
     def _run(self) -> None:
         while not self._closed:
@@ -249,11 +253,26 @@ class MetricsServer:
                 if not self._closed:
                     time.sleep(0.1)
                 continue
-            self._client = client
-            with client, contextlib.suppress(OSError):
-                if not self._closed:
-                    client.sendall(self._answer(_read_head(client)))
-            self._client = None
+            clients = list(self._clients.values())
+            if len(clients) >= _MOST_CLIENTS:
+                _shut_down(clients[0])
+            self._begin(client)
+
+    def _begin(self, client: socket.socket) -> None:
+        thread = threading.Thread(
+            target=self._serve, args=(client,), name="fiber-metrics-client", daemon=True
+        )
+        self._clients[thread] = client
+        try:
+            thread.start()
+        except RuntimeError:  # the system has no room for a thread
+            del self._clients[thread]
+            client.close()
+
+    def _serve(self, client: socket.socket) -> None:
+        with client, contextlib.suppress(OSError):
+            client.sendall(self._answer(_read_head(client)))
+        self._clients.pop(threading.current_thread(), None)
 
     def _answer(self, head: str) -> bytes:
         request, *headers = head.split("\r\n")
@@ -270,6 +289,12 @@ class MetricsServer:
             return _response("503 Service Unavailable", "text/plain", f"{error}\n".encode())
         answer = _response("200 OK", kind, body)
         return answer if method == "GET" else answer[: -len(body)]
+
+
+def _shut_down(sock: socket.socket) -> None:
+    """End the waits of other threads for a socket."""
+    with contextlib.suppress(OSError):
+        sock.shutdown(socket.SHUT_RDWR)
 
 
 def _read_head(client: socket.socket) -> str:

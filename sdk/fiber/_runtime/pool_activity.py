@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from fiber._engine.activity import SEVERAL, Activity, WorkReport
+from fiber._engine.activity import SEVERAL, Activity, WorkReport, WorkSource
 from fiber._engine.tasks import Receipt, WorkerEntry
 from fiber._runtime.answers import is_failure
 from fiber._runtime.work_items import WorkItem
@@ -73,6 +73,10 @@ class PoolActivity:
             record.held += work.seconds  # the caller may have paused between the calls
             record.noted = work.end
             self._activity.worked(record, work)
+
+    def notes_of(self, source: WorkSource) -> None:
+        """Have ``source`` note its work before the activity is read."""
+        self._activity.sources.add(source)
 
     def retried(self) -> None:
         """Note that a task runs again after an error."""

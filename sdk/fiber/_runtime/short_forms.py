@@ -1,4 +1,8 @@
-"""Short forms of tasks' arguments, for monitors.  No code of the user runs for them."""
+"""Short forms of tasks' arguments, for monitors.
+
+They are made on the loop thread, so each takes little time: a form has a few parts of a value, and
+no code of the user runs for it.
+"""
 
 from __future__ import annotations
 
@@ -6,48 +10,99 @@ import contextlib
 import io
 import itertools
 import pickle
-import reprlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
-from fiber._wire import work
-
-_LARGEST = 1 << 12
+_LARGEST_PICKLE = 1 << 12
 """Bytes of the largest pickle that is looked into."""
 
-_MOST = 6
-"""Arguments of a call that its short form has."""
+_PARTS = 30
+"""Values in a short form, those inside of others included."""
+
+_ITEMS = 6
+"""Items of a list, a call or another container that a short form shows."""
+
+_CHARACTERS = 40
+"""Characters of a text that a short form shows."""
+
+_BITS = 256
+"""Bits of the largest number that is written out."""
+
+_MORE = "..."
+
+_BRACKETS = {list: "[]", tuple: "()", set: "{}", frozenset: "{}", dict: "{}"}
+
+_name_of = type.__dict__["__name__"].__get__
+"""Return the name of a class.  A metaclass cannot replace it."""
 
 
 def short_form(item: Any) -> str:
-    """Return the short form of an item, if its repr runs none of the user's code; else nothing."""
-    if work.is_plain([item]):
-        with contextlib.suppress(ValueError):  # Python writes no number of thousands of digits
-            return reprlib.repr(item)
-    return ""
+    """Return the short form of an item; an object that is no plain value is ``<its class>``."""
+    return _Writer().form(item)
 
 
 def short_form_of_call(data: bytes, buffers: Sequence[memoryview]) -> str:
     """Return the short form of the arguments of a pickled call, as in ``5, label='a'``.
 
-    An object that is no plain value is shown as ``<its class>``.  The result is empty for a large
-    pickle, and for objects that pickle in unusual ways.
+    The result is empty for a large pickle, and for objects that pickle in unusual ways.
     """
-    if len(data) > _LARGEST:
+    if len(data) > _LARGEST_PICKLE:
         return ""
-    # Pickles are programs, and a program of any kind may fail with stand-ins for its objects.
+    # A pickle is a program, and may fail with stand-ins for its objects.
     with contextlib.suppress(Exception):
         _, args, kwargs = _PlainUnpickler(io.BytesIO(data), buffers=buffers).load()
-        forms = list(itertools.islice(_forms(args, kwargs), _MOST + 1))
-        return ", ".join(forms[:_MOST] + ["..."] * (len(forms) > _MOST))
+        return _Writer().arguments(args, kwargs)
     return ""
 
 
-def _forms(args: Any, kwargs: Any) -> Iterator[str]:
-    for value in args:
-        yield reprlib.repr(value)
-    for key, value in kwargs.items():
-        yield f"{key}={reprlib.repr(value)}"
+class _Writer:
+    """Writer of one short form.  Its parts are counted, so that shared lists take no longer."""
+
+    def __init__(self) -> None:
+        self._left = _PARTS
+
+    def arguments(self, args: Iterable[Any], kwargs: dict[str, Any]) -> str:
+        """Return the form of the arguments of a call."""
+        named = (f"{key}={self.form(value)}" for key, value in kwargs.items())
+        return self._joined(itertools.chain(map(self.form, args), named))
+
+    def form(self, value: Any) -> str:
+        """Return the form of a value."""
+        self._left -= 1
+        kind = type(value)
+        if kind in (bool, float, complex, type(None), range):
+            return repr(value)
+        if kind is int:
+            bits = value.bit_length()
+            return repr(value) if bits <= _BITS else f"<int of {bits:,} bits>"
+        if kind in (str, bytes):
+            short = value[:_CHARACTERS]
+            return repr(short) + (_MORE if len(short) < len(value) else "")
+        if kind in _BRACKETS:
+            return self._container(value, kind)
+        if isinstance(value, _StandIn):
+            return repr(value)
+        return _name_of(value) if isinstance(value, type) else f"<{_name_of(kind)}>"
+
+    def _container(self, value: Any, kind: type) -> str:
+        left, right = _BRACKETS[kind]
+        if kind is dict:
+            forms = (f"{self.form(key)}: {self.form(each)}" for key, each in value.items())
+        else:
+            forms = map(self.form, value)
+        inside = self._joined(forms)
+        comma = "," if kind is tuple and len(value) == 1 else ""
+        return f"{left}{inside}{comma}{right}"
+
+    def _joined(self, forms: Iterator[str]) -> str:
+        """Return the first forms; another value changed by a thread of the user ends them."""
+        shown: list[str] = []
+        with contextlib.suppress(RuntimeError):
+            while self._left > 0 and (form := next(forms, None)) is not None:
+                if len(shown) == _ITEMS:
+                    return ", ".join([*shown, _MORE])
+                shown.append(form)
+        return ", ".join([*shown, _MORE] if self._left <= 0 else shown)
 
 
 class _PlainUnpickler(pickle.Unpickler):
@@ -65,9 +120,6 @@ class _PlainUnpickler(pickle.Unpickler):
 
 class _StandInType(type):
     """Class or function that was not imported."""
-
-    def __repr__(cls) -> str:
-        return cls.__name__
 
 
 class _StandIn(metaclass=_StandInType):

@@ -207,7 +207,8 @@ class Runtime:
         try:
             address = self.hub.address_or_problem if self._cleans_up() else self.hub.known_address
             if address is not None and (directory := os.path.dirname(address.path)):
-                self._monitor = MonitorServer(self.loop, directory, self._answer_monitor)
+                name = program_name()
+                self._monitor = MonitorServer(self.loop, directory, name, self._answer_monitor)
             if self.config.dashboard and _is_program():
                 self._open_dashboard()
         except (OSError, FiberError) as error:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
-import os
 import signal
+import sys
 
 import fiber
 
@@ -20,14 +21,21 @@ def linger(_: int) -> None:
 
 
 def main() -> None:
-    """Run 100 tasks, then two that do not end; leave when both have lost their workers."""
+    """Run 100 tasks, then two that do not end; leave when both have lost their workers.
+
+    With ``--stay``, wait for an interrupt before that.
+    """
     fiber.init(retries=0)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     with fiber.Pool(2) as pool:
         total = sum(pool.map(double, range(100)))
         results = [pool.apply_async(linger, (number,)) for number in range(2)]
-        print(json.dumps({"event": "waiting", "total": total, "pid": os.getpid()}), flush=True)
-        for result in results:
-            result.wait()
+        print(json.dumps({"event": "waiting", "total": total}), flush=True)
+        with contextlib.suppress(KeyboardInterrupt):
+            for result in results:
+                result.wait()
+            if "--stay" in sys.argv:
+                signal.pause()
     print(json.dumps({"event": "left"}), flush=True)
 
 
