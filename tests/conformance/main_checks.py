@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import fiber
@@ -16,6 +17,7 @@ print("top level of", __name__, flush=True)
 
 class Point:
     def __init__(self, x): self.x = x
+    def plus(self, y): return self.x + y
 
 class Trouble(Exception): pass
 
@@ -28,6 +30,8 @@ def fail(x): raise Trouble(x)
 def send(connection): connection.send(os.getpid())
 
 triple = lambda x: 3 * x
+
+def adding(y): return lambda x: triple(x) + y
 
 """
 """Program without blank lines within a block and with one after it, so that it can be typed."""
@@ -60,6 +64,9 @@ def _check_pool(main: dict[str, Any], pool: Any) -> None:
     point = main["Point"]
     assert pool.map(main["double"], range(3)) == [0, 2, 4]
     assert pool.apply(main["triple"], (1,)) == 3
+    assert pool.apply(main["adding"](1), (1,)) == 4
+    assert pool.apply(partial(main["double"], 4)) == 8
+    assert pool.apply(point(1).plus, (2,)) == 3
     moved = list(pool.imap(main["move"], [point(1), point(2)]))
     assert all(isinstance(each, point) for each in moved)
     assert [each.x for each in moved] == [2, 3]

@@ -63,7 +63,8 @@ class FunctionCache:
     """Recognizes functions by their pickles.  Runs on any thread."""
 
     def __init__(self) -> None:
-        self._by_value = FunctionPickles()
+        self.light = FunctionPickles().light
+        """Return what to pickle in place of a function."""
         self._known: dict[bytes, Function] = {}
         self._ids = itertools.count(1)
 
@@ -84,10 +85,6 @@ class FunctionCache:
                 self._known.clear()  # in one step, as several threads may call this
             self._known[data] = made
         return made
-
-    def light(self, function: Callable[..., Any]) -> Any:
-        """Return what to pickle in place of ``function``; see ``FunctionPickles``."""
-        return self._by_value.light(function)
 
 
 class InputStream:
