@@ -1,0 +1,8 @@
+"""The parts of gym.utils that the published programs use."""
+
+from gym.utils import seeding as seeding
+
+
+def colorize(text, *options, **more):
+    """Return the text, without colours."""
+    return text
