@@ -43,14 +43,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     every = programs()
     options = _parse(every, arguments)
     results = table.read(RESULTS)
-    failed = [
-        name
-        for name, program in every.items()
-        if name in options.only and not compare(program, options.clones, options.backends, results)
-    ]
-    table.write(RESULTS, results)
-    page = PAGE.read_text(encoding="utf-8")
-    PAGE.write_text(table.put_into(page, table.rows(every, results)), encoding="utf-8")
+    failed = []
+    for name in options.only:
+        if not compare(every[name], options.clones, options.backends, results):
+            failed.append(name)
+        # After each program, so that an interrupted run keeps what it has found.
+        table.write(RESULTS, results)
+        page = PAGE.read_text(encoding="utf-8")
+        PAGE.write_text(table.put_into(page, table.rows(every, results)), encoding="utf-8")
     if failed:
         print(f"published: not run, or not the same: {', '.join(failed)}", file=sys.stderr)
     return 1 if failed else 0
@@ -136,7 +136,7 @@ def _parse(every: dict[str, Program], arguments: Sequence[str] | None) -> argpar
     parser = argparse.ArgumentParser(prog="published")
     parser.add_argument("clones", type=Path, help="folder with a clone of each project")
     parser.add_argument("--only", nargs="+", metavar="NAME", default=list(every))
-    parser.add_argument("--backends", nargs="+", choices=table.BACKENDS, default=_available())
+    parser.add_argument("--backends", nargs="+", choices=table.BACKENDS, default=available())
     options = parser.parse_args(arguments)
     if not options.clones.is_dir():
         parser.error(f"{options.clones} is no folder: name the folder with the clones")
@@ -146,7 +146,7 @@ def _parse(every: dict[str, Program], arguments: Sequence[str] | None) -> argpar
     return options
 
 
-def _available() -> list[str]:
+def available() -> list[str]:
     """Return the backends that can run here: pods need a cluster and an image."""
     pods = os.environ.get("KUBECONFIG") and os.environ.get("FIBER_IMAGE")
     return [name for name in table.BACKENDS if name != "kubernetes" or pods]

@@ -47,7 +47,8 @@ def rows(programs: dict[str, Program], results: Results) -> list[str]:
     ]
     for name, program in programs.items():
         if name in results:
-            lines.append("| " + " | ".join(_cells(program, results[name])) + " |")
+            cells = (cell.replace("|", "\\|") for cell in _cells(program, results[name]))
+            lines.append(f"| {' | '.join(cells)} |")
     return lines
 
 

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from conformance.gymnasium_vector import TESTS_OF_ASYNC_VECTOR_ENV
 from published.records import Package, Program, Version
 from published.runs import Run, Value
+
+TESTS = ("tests/vector/test_async_vector_env.py",)
 
 
 def run(run: Run) -> dict[str, Value]:
     """Run the tests; compare their outcomes."""
     run.import_from()
     adopted = ["gymnasium.vector.async_vector_env"]
-    return run.tests(*TESTS_OF_ASYNC_VECTOR_ENV, cwd=run.clone, adopt=adopted)
+    return run.tests(*TESTS, cwd=run.clone, adopt=adopted)
 
 
 PROGRAMS = [
@@ -22,7 +23,7 @@ PROGRAMS = [
         way="`fiber.adopt`",
         ran="its tests of `AsyncVectorEnv`",
         run=run,
-        files=TESTS_OF_ASYNC_VECTOR_ENV,
+        files=TESTS,
         packages=(
             Package("numpy", "numpy>=1.26"),
             Package("pytest", "pytest>=8.3"),

@@ -4,13 +4,17 @@ An environment's `step` returns four values, `reset` returns the observation, an
 Programs of that time also use names that numpy 2 has removed.
 """
 
+import sys
+
 import gymnasium
 import numpy as np
 
 from gym import spaces as spaces
-from gym import utils as utils
+from gym import utilities as utils
 
 np.product = np.prod
+sys.modules["gym.utils"] = utils
+sys.modules["gym.utils.seeding"] = utils.seeding
 
 
 class Env:

@@ -1,6 +1,6 @@
 """The parts of gym.utils that the published programs use."""
 
-from gym.utils import seeding as seeding
+from gym import seeding as seeding
 
 
 def colorize(text, *options, **more):
