@@ -23,7 +23,6 @@ from typing import Any
 from published import checks, table
 from published.comparing import difference, leaves
 from published.records import Program, programs
-from published.runs import MULTIPROCESSING
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "docs" / "published.json"

@@ -71,8 +71,7 @@ def missing_package(package: Package) -> str | None:
         return f"{package.module} is not that of {wanted.name}: pip install {str(wanted)!r}"
     if not wanted.specifier.contains(version, prereleases=True):
         return (
-            f"{wanted.name} {version} is installed, which does not fit: "
-            f"pip install {str(wanted)!r}"
+            f"{wanted.name} {version} is installed, which does not fit: pip install {str(wanted)!r}"
         )
     return None
 

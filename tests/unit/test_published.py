@@ -68,7 +68,10 @@ def test_a_missing_clone_is_one_line_that_says_how_to_get_it(tmp_path: Path) -> 
         (record(files=("main.py",)), "has no main.py, so its version does not fit"),
         (record(version=Version("version.py", ">=2.0")), "has version 1.2, which does not fit"),
         (record(version=Version("absent.py", ">=2.0")), "says no version"),
-        (record(packages=(Package("no_such_box", "no-such-box>=2"),)), "pip install 'no-such-box>=2'"),
+        (
+            record(packages=(Package("no_such_box", "no-such>=2"),)),
+            "pip install 'no-such>=2'",
+        ),
         (record(packages=(Package("pytest", "pytest>=9999"),)), "pip install 'pytest>=9999'"),
         (record(packages=(Package("pytest", "no-such-box"),)), "pip install 'no-such-box'"),
         (record(roms=("no_such_game",)), "ROM of no_such_game is not installed: pip install"),
@@ -159,7 +162,7 @@ def test_changed_lines_are_counted_in_a_copy(clones: Path, tmp_path: Path) -> No
     assert run.changed == ["import fiber as multiprocessing"]
     assert program.read_text() == "import fiber as multiprocessing\nrun()\n"
     assert (clones / "walker" / "main.py").read_text() == "import multiprocessing\nrun()\n"
-    with pytest.raises(RunFailed, match="0 times 'absent'.* does not fit"):
+    with pytest.raises(RunFailed, match=r"0 times 'absent'.* does not fit"):
         run.replace(program, "absent", "present")
     assert added_lines("a\nb\n", "a\nc\nd\n") == ["c", "d"]
 

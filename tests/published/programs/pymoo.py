@@ -36,9 +36,7 @@ def run(run: Run) -> dict[str, Value]:
             xu=5,
             elementwise_runner=starmap(pool.starmap),
         )
-        result = minimize(
-            problem, algorithm(pop_size=POPULATION), ("n_gen", GENERATIONS), seed=1
-        )
+        result = minimize(problem, algorithm(pop_size=POPULATION), ("n_gen", GENERATIONS), seed=1)
     return {
         "solutions": result.pop.get("X").tolist(),
         "objectives": result.pop.get("F").tolist(),

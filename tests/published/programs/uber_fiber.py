@@ -9,7 +9,7 @@ from pathlib import Path
 from published.records import Package, Program
 from published.runs import Run, RunFailed, Value
 
-EXAMPLES = ("basic_process", "basic_queue", "line_count", "parzen_estimation", "shared_data")
+EXAMPLES = ("basic_queue", "line_count", "parzen_estimation", "shared_data")
 NOTEBOOK = "examples/gecco-2020/Fiber_ES_tutorial.ipynb"
 ASYNC = "examples/async_manager.py"
 SOLUTION = (5.0, -5.0, 1.5)
@@ -65,7 +65,8 @@ finally:
 
 
 def _lines(run: Run, program: Path) -> list[str]:
-    return run.script(program, cwd=program.parent).splitlines()
+    printed = run.script(program, cwd=program.parent)
+    return re.sub(r"\bat 0x[0-9a-f]+", "at an address", printed).splitlines()
 
 
 UPSTREAM = "https://github.com/uber/fiber"

@@ -20,7 +20,7 @@ sys.modules["gym.utils.seeding"] = utils.seeding
 class Env:
     """Environment with the interface of that time."""
 
-    metadata = {"render.modes": []}
+    metadata = None
     spec = None
     observation_space = None
     action_space = None
@@ -105,7 +105,10 @@ class _Made(Env):
             import ale_py
 
             gymnasium.register_envs(ale_py)
-        self._env = gymnasium.make(name, disable_env_checker=True).unwrapped
+        # Deterministic environments skip three frames of four, and repeat no action by chance.
+        options = {"frameskip": 4} if "Deterministic" in name else {}
+        known = name.replace("Deterministic", "NoFrameskip")
+        self._env = gymnasium.make(known, disable_env_checker=True, **options).unwrapped
         self._limit = self._env.spec.max_episode_steps
         self._elapsed_steps = 0
         self._seed = None

@@ -1,4 +1,5 @@
 """Classes of environments, by the name of their module."""
 
-from gym import Env as Env
-from gym import Wrapper as Wrapper
+from gym import Env, Wrapper
+
+__all__ = ["Env", "Wrapper"]

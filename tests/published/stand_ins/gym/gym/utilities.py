@@ -1,6 +1,8 @@
 """The parts of gym.utils that the published programs use."""
 
-from gym import seeding as seeding
+from gym import seeding
+
+__all__ = ["colorize", "seeding"]
 
 
 def colorize(text, *options, **more):
