@@ -86,7 +86,9 @@ def verdict(expected: dict[str, Any] | None, ended: Ended) -> str:
     found = difference(expected["values"], ended.result["values"])
     if found:
         return f"differs: {found}"
-    return f"same ({len(leaves(expected['values']))} values)"
+    values = list(leaves(expected["values"]).values())
+    failures = sum(value in ("failure", "error") for value in values)
+    return f"same ({len(values)} values{f', {failures} of them failures' if failures else ''})"
 
 
 def _run(program: Program, clone: Path, backend: str) -> Ended:

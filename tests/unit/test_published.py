@@ -149,6 +149,8 @@ def test_values_are_compared_to_the_last_bit(found: dict[str, Value], said: str 
 def test_a_verdict_says_what_happened() -> None:
     expected = {"values": {"a": [1, 2]}}
     assert verdict(expected, Ended({"values": {"a": [1, 2]}})) == "same (2 values)"
+    failed = {"values": {"test": "failure", "other": "passed"}}
+    assert verdict(failed, Ended(failed)) == "same (2 values, 1 of them failures)"
     assert verdict(expected, Ended({"values": {"a": [1, 3]}})).startswith("differs: a[1] is 3")
     assert verdict(expected, Ended(None, "status 1")) == "failed: status 1"
     assert verdict(None, Ended(None)) == "not run: it failed with multiprocessing"

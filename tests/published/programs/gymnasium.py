@@ -27,6 +27,7 @@ PROGRAMS = [
         packages=(
             Package("numpy", "numpy>=1.26"),
             Package("pytest", "pytest>=8.3"),
+            Package("pygame", "pygame-ce>=2.1.3"),
             Package("farama_notifications", "farama-notifications>=0.0.1"),
         ),
         version=Version("gymnasium/__init__.py", ">=1.0"),

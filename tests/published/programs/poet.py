@@ -26,10 +26,13 @@ def run(run: Run) -> dict[str, Value]:
     copied = run.copy()
     noise = copied / "poet_distributed" / "noise.py"
     run.replace(noise, "debug = False\n", "debug = True\n")
-    # Without its bounds, this function of the published commit fails at the first reproduction.
+    # Two functions of the published commit fail at the first reproduction: one is called without
+    # its bounds, the other with no score, as long as no terrain is archived.
     strategy = copied / "poet_distributed" / "es.py"
-    whole = "def cap_score(score, lower=lower, upper=upper):\n"
+    whole = "def cap_score(score, lower=lower_bound, upper=upper_bound):\n"
     run.replace(strategy, "def cap_score(score, lower, upper):\n", whole)
+    algorithm = copied / "poet_distributed" / "poet_algo.py"
+    run.replace(algorithm, "if score < self", "if score is None or score < self")
     logs = run.folder / "poet"
     logs.mkdir()
     run.script(copied / "master.py", str(logs), *OPTIONS.split(), cwd=copied)
@@ -55,7 +58,7 @@ PROGRAMS = [
         upstream="https://github.com/uber-research/poet",
         clone="poet",
         way="it imports fiber",
-        ran="3 iterations, up to 3 terrains; one line makes its table of noise small, one mends a call",
+        ran="3 iterations, up to 3 terrains; a line makes its noise table small, two mend calls",
         run=run,
         files=("master.py", "poet_distributed/poet_algo.py"),
         packages=(
