@@ -41,24 +41,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the chosen programs; return 0 if each ran and repeated multiprocessing's values."""
     every = programs()
     options = _parse(every, arguments)
-    results = table.read(RESULTS)
     failed = []
     for name in options.only:
-        if not compare(every[name], options.clones, options.backends, results):
+        if not compare(every[name], options.clones, options.backends):
             failed.append(name)
-        # After each program, so that an interrupted run keeps what it has found.
-        table.write(RESULTS, results)
-        page = PAGE.read_text(encoding="utf-8")
-        PAGE.write_text(table.put_into(page, table.rows(every, results)), encoding="utf-8")
     if failed:
         print(f"published: not run, or not the same: {', '.join(failed)}", file=sys.stderr)
     return 1 if failed else 0
 
 
-def compare(
-    program: Program, clones: Path, backends: Sequence[str], results: table.Results
-) -> bool:
-    """Run one program on all backends, and add its results; False if one is missing or differs."""
+def compare(program: Program, clones: Path, backends: Sequence[str]) -> bool:
+    """Run one program on all backends and write its results; False if one is missing or differs."""
     if line := checks.missing(program, clones):
         print(line, file=sys.stderr)
         return False
@@ -73,8 +66,17 @@ def compare(
         outcome[backend] = verdict(expected, ended)
         print(f"{program.name} on {backend}: {outcome[backend]}", flush=True)
     if expected:
-        table.add(results, program.name, checks.commit(clone), changed, outcome)
+        _write(program.name, checks.commit(clone), changed, outcome)
     return bool(expected) and all(each.startswith("same") for each in outcome.values())
+
+
+def _write(name: str, commit: str, changed: list[str], outcome: dict[str, str]) -> None:
+    """Add results to the file and the page, so that an interrupted run keeps what it has found."""
+    results = table.read(RESULTS)
+    table.add(results, name, commit, changed, outcome)
+    table.write(RESULTS, results)
+    page = PAGE.read_text(encoding="utf-8")
+    PAGE.write_text(table.put_into(page, table.rows(programs(), results)), encoding="utf-8")
 
 
 def verdict(expected: dict[str, Any] | None, ended: Ended) -> str:

@@ -12,8 +12,8 @@ from published.runs import Run, Value
 NUMBER = re.compile(r"-?[0-9.]+(e[+-][0-9]+)?")
 # Few short episodes; every environment reproduces, and every child is admitted.
 OPTIONS = (
-    "--init=random --master_seed=111 --num_workers=2 --n_iterations=3 --batch_size=1 "
-    "--batches_per_chunk=2 --eval_batch_size=1 --eval_batches_per_step=2 --max_num_envs=3 "
+    "--init=random --master_seed=111 --num_workers=2 --n_iterations=2 --batch_size=1 "
+    "--batches_per_chunk=2 --eval_batch_size=1 --eval_batches_per_step=1 --max_num_envs=3 "
     "--steps_before_transfer=1 --adjust_interval=1 --repro_threshold=-1000 --mc_lower=-1000 "
     "--mc_upper=1000 --normalize_grads_by_noise_std --propose_with_adam "
     "--returns_normalization=centered_ranks --envs stump pit roughness"
@@ -58,7 +58,7 @@ PROGRAMS = [
         upstream="https://github.com/uber-research/poet",
         clone="poet",
         way="it imports fiber",
-        ran="3 iterations, up to 3 terrains; a line makes its noise table small, two mend calls",
+        ran="2 iterations, 2 terrains; a line makes its noise table small, two mend calls",
         run=run,
         files=("master.py", "poet_distributed/poet_algo.py"),
         packages=(
