@@ -119,11 +119,19 @@ def _run(program: Program, clone: Path, backend: str) -> Ended:
 
 
 def _environment() -> dict[str, str]:
-    """Return the environment of runs: one thread for each library, so that sums are the same."""
+    """Return the environment of runs.
+
+    Libraries have one thread each, so that sums are the same, and children may take long to import
+    them on a busy machine.
+    """
     paths = [str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")]
     single = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-    path = os.pathsep.join(filter(None, paths))
-    return {**os.environ, **single, "PYTHONPATH": path, "PYTHONHASHSEED": "0"}
+    ours = {
+        "FIBER_START_TIMEOUT": "600",
+        "PYTHONHASHSEED": "0",
+        "PYTHONPATH": os.pathsep.join(filter(None, paths)),
+    }
+    return {**os.environ, **single, **ours}
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
