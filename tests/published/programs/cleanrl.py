@@ -33,6 +33,7 @@ PROGRAMS = [
         files=("cleanrl/ppo.py",),
         packages=(
             Package("gymnasium", "gymnasium>=1.0"),
+            Package("tensorboard", "tensorboard>=2.9"),  # workers import its program, too
             Package("torch", "torch>=2.3"),
             Package("tyro", "tyro>=0.8"),
         ),
