@@ -22,7 +22,7 @@ unexport PYTHONDONTWRITEBYTECODE
 CLUSTER := PYTHONPATH=tests $(BIN)/python -m cluster
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-fast test-pythons test-long e2e lint bench bench-operator bench-kubernetes conformance conformance-original crds docs pictures images cluster cluster-down release release-prepare release-dry-run clean
+.PHONY: help demo test test-fast test-pythons test-long e2e lint bench bench-operator bench-kubernetes conformance conformance-original published crds docs pictures images cluster cluster-down release release-prepare release-dry-run clean
 
 help:
 	@sed -n 's/^## //p' $(MAKEFILE_LIST)
@@ -120,6 +120,12 @@ conformance: $(VENV)/.with-dev $(VENV)/.with-testsuite
 conformance-original: $(VENV)/.with-dev
 	$(BIN)/python tests/conformance/uber_fiber.py "$(CHECKOUT)" --timeout 120
 
+## make published CLONES=…  published programs on Fiber, compared with themselves on multiprocessing
+##                    (ONLY="poet DEAP" runs some of them, BACKENDS=local some of the backends)
+published: $(VENV)-published/.with-published
+	PYTHONPATH=tests $(VENV)-published/bin/python -m published "$(CLONES)" \
+		$(if $(ONLY),--only $(ONLY)) $(if $(BACKENDS),--backends $(BACKENDS))
+
 ## make crds          crds/fiberpools.yaml and the chart's copy, from the model
 crds: $(VENV)/.with-dev
 	$(BIN)/python -m fiber_api.schema
@@ -206,6 +212,16 @@ $(VENV)/.with-testsuite: $(VENV)/.made
 # Chromium. Where it cannot be installed, the tests of the dashboard in a browser are skipped.
 $(VENV)/.with-browser: $(VENV)/.made
 	-.ci/browser && touch $@
+
+# torch is larger than all other packages together, so only this environment has it.
+$(VENV)-published/.made:
+	.ci/python make-venv $(VENV)-published $(PYTHON)
+	touch $@
+
+$(VENV)-published/.with-published: $(VENV)-published/.made pyproject.toml tests/published/requirements.txt
+	$(VENV)-published/bin/python -m pip install --quiet --disable-pip-version-check \
+		--editable '.[vector]' --requirement tests/published/requirements.txt
+	touch $@
 
 .venv-%/.made:
 	.ci/python make-venv .venv-$* "$$(.ci/python find $*)"

@@ -1,0 +1,3 @@
+"""Spaces: those of gymnasium."""
+
+from gymnasium.spaces import *  # noqa: F403
