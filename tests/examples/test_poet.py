@@ -14,7 +14,7 @@ def test_the_population_grows_and_is_the_same_on_each_backend(tmp_path: Path) ->
     picture = tmp_path / "poet.png"
     outputs = []
     for backend in BACKENDS:
-        done = run("08-poet/poet.py", *SMALL, "--out", picture, backend=backend)
+        done = run("08-poet/train_poet.py", *SMALL, "--out", picture, backend=backend)
         assert picture.read_bytes().startswith(b"\x89PNG")
         assert not done.stderr
         outputs.append(done.stdout)

@@ -83,7 +83,6 @@ def draw(path: Path, history: list[tuple[dict[int, float], int]]) -> None:
     figure.colorbar(image, ax=lives, label="crossed by each pair, percent")
     sizes.plot([(len(pairs), workers) for pairs, workers in history], drawstyle="steps-mid")
     sizes.legend(["pairs", "workers"], frameon=False)
-    sizes.set_xlabel("iteration")
     figure.savefig(path)
 
 
