@@ -25,7 +25,7 @@ def test_the_return_rises(backend: str, tmp_path: Path) -> None:
 
 
 def test_v_trace_on_policy_is_the_discounted_sum(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With the actor's own policy, targets are the returns that follow, and the last value."""
+    """Targets of the actor's own policy are the returns that follow, up to the last value."""
     monkeypatch.syspath_prepend(str(EXAMPLES / "10-impala"))
     network = importlib.import_module("vtrace")
     rewards, over = np.array([[1.0], [2.0], [4.0]]), np.array([[False], [True], [False]])
