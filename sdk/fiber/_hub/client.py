@@ -223,6 +223,10 @@ class HubStream:
         self._unsettled = False
         return reply
 
+    def ask_on(self) -> Reply:
+        """Wait for a further reply to the request of ``ask``."""
+        return self._reply(self._asked, None)
+
     def begin(self, operation: Op, buffers: Sequence[memoryview]) -> None:
         """Send a request.  ``finish`` reads the reply."""
         _refuse_on_loop()

@@ -5,13 +5,20 @@ from __future__ import annotations
 import hmac
 import os
 import struct
+from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Protocol
 
 from fiber._hub import protocol
 from fiber._hub.heap import Block
-from fiber._hub.hosted import HostedChannel, HostedCounter, HostedSemaphore, HostedWaitList
+from fiber._hub.hosted import (
+    HostedChannel,
+    HostedCounter,
+    HostedSemaphore,
+    HostedWaitList,
+    Parts,
+)
 from fiber._hub.protocol import (
     FOUR,
     GRANTING,
@@ -31,6 +38,7 @@ from fiber._hub.protocol import (
 from fiber._hub.registry import Hosted, NoSuchObject, ObjectAttachment, Registry
 from fiber._hub.replicas import BlockIdentity, Replicas
 from fiber._hub.streams import NullHandler, Stream
+from fiber._wire import bundle
 from fiber._wire.packet import Message
 
 _NAME_BYTES = 80
@@ -62,7 +70,7 @@ class RequestRefused(Exception):
 class PendingRequest:
     """Request that waits for its reply, which is sent once."""
 
-    __slots__ = ("_handler", "_number", "_on_ok")
+    __slots__ = ("_handler", "_number", "_on_ok", "on_withdrawal")
 
     def __init__(
         self, handler: ClientHandler, number: int, on_ok: Callable[[], None] | None = None
@@ -70,6 +78,8 @@ class PendingRequest:
         self._handler = handler
         self._number = number
         self._on_ok = on_ok
+        self.on_withdrawal: Callable[[], None] | None = None
+        """Function to call if the request ends without a reply."""
 
     def answer(self, status: Status, value: int = 0, buffers: Sequence[memoryview] = ()) -> None:
         """Send the reply."""
@@ -78,6 +88,10 @@ class PendingRequest:
         if self._on_ok is not None and status is Status.OK:
             self._on_ok()
         self._handler.stream.send(ONE.pack(status, self._number, value), buffers)
+
+    def report(self) -> None:
+        """Send a reply before the last one: the request was understood."""
+        self._handler.stream.send(ONE.pack(Status.OK, self._number, 0))
 
     @property
     def number(self) -> int:
@@ -171,6 +185,8 @@ class ClientHandler:
         request, self.waiting = self.waiting, None
         if request is not None and self._hosted is not None:
             self._hosted.withdraw(request)
+            if request.on_withdrawal is not None:
+                request.on_withdrawal()
         return request
 
     def _request(
@@ -307,7 +323,23 @@ class ClientHandler:
         """Send a message."""
         if not message.buffers:
             raise RequestRefused("there is no message to send")
-        self._channel().send(self._request(message), message.buffers)
+        payload, *buffers = message.buffers
+        self._channel().send(self._request(message), deque([(payload, buffers)]))
+
+    def put_items(self, message: Message) -> None:
+        """Count the messages of a bundle, reply, and send them.
+
+        When the client ends, messages that are not sent yet are dropped and no longer counted.
+        """
+        counter = self._counter_named_in(message)
+        items: deque[Parts] = deque((item, ()) for item in bundle.unpack(message.buffers[0]))
+        request = self._request(message)
+        counter.add(len(items))
+        self._channel().send(request, items)
+        if items and self.waiting is request:
+            request.report()
+            own_count = counter.duplicate()  # the client may end its use of the counter first
+            request.on_withdrawal = lambda: own_count.lower(len(items))
 
     def recv(self, message: Message) -> None:
         """Receive a message."""
@@ -316,6 +348,11 @@ class ClientHandler:
     def draw(self, message: Message) -> None:
         """Receive a message and raise a counter."""
         granted = partial(self._counter_named_in(message).add, 1)
+        self._channel().receive(self._request(message, granted))
+
+    def get_item(self, message: Message) -> None:
+        """Receive a message and lower a counter."""
+        granted = partial(self._counter_named_in(message).lower, 1)
         self._channel().receive(self._request(message, granted))
 
     def poll(self, message: Message) -> None:

@@ -21,7 +21,7 @@ from collections.abc import Callable
 from enum import IntEnum, IntFlag
 from typing import NamedTuple
 
-VERSION = 5
+VERSION = 6
 KEY_BYTES = 32
 
 SECRET_BYTES = 16
@@ -98,6 +98,8 @@ class Op(IntEnum):
     WATCH = 14  # silent; the stream gets READY once the channel is readable
     CHECK = 15  # NO if it is not readable now; then as WATCH
     DRAW = 16  # token of a counter -> as RECV; raises that counter by one
+    PUT_ITEMS = 17  # token of a counter; a bundle beside it -> 0 once counted, then 1 once sent
+    GET_ITEM = 18  # token of a counter -> as RECV; lowers that counter by one
     # For an attached counter
     ADD = 20  # how much
     TAKE = 21

@@ -32,7 +32,7 @@ from fiber._hub.protocol import (
     Status,
 )
 from fiber._transport.channels import Claimant, wait_readable
-from fiber._wire import packet
+from fiber._wire import bundle, packet
 from fiber._wire.memory_files import BytesLike
 from fiber._wire.packet import Message
 from fiber.errors import ConnectionClosed
@@ -233,6 +233,26 @@ class RemoteChannel(RemoteObject):
         """Receive a message, and have the hub raise ``counter``; None if there is no message."""
         timeout = None if wait else 0
         return self._receive(Op.DRAW, counter.known(), form=SECRET, timeout=timeout)
+
+    def recv_uncounting(self, counter: RemoteCounter, *, wait: bool) -> Message | None:
+        """Receive a message, and have the hub lower ``counter``; None if there is no message."""
+        timeout = None if wait else 0
+        return self._receive(Op.GET_ITEM, counter.known(), form=SECRET, timeout=timeout)
+
+    @contextmanager
+    def put_items(self, items: Sequence[bytes], counter: RemoteCounter) -> Iterator[None]:
+        """Send messages, and have the hub raise ``counter`` by their number.
+
+        They are counted when the context begins, and can be received when it ends.
+        """
+        token = counter.known()
+        with _naming_the_end(), self.stream() as stream:
+            parts = [memoryview(bundle.pack(items))]
+            reply = stream.ask(Op.PUT_ITEMS, token, form=SECRET, buffers=parts)
+            yield
+            if reply.status is Status.OK and not reply.values[0]:
+                reply = stream.ask_on()
+            _check_sent(reply)
 
     def _receive(
         self,
