@@ -35,7 +35,7 @@ class _Step:
 
 
 class Meeting:
-    """One process's wait at a barrier.  Runs on the loop thread.
+    """Wait of a process of another host at a barrier.  Runs on the loop thread.
 
     The reply to ``request`` is OK with the index of the process, BROKEN, or NO: then the process is
     not counted.
