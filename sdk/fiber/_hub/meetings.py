@@ -23,7 +23,7 @@ FILLING, DRAINING, BROKEN = 0, 1, -2
 """States of threading's barrier."""
 
 
-class _Step:
+class _MeetingStep:
     """Wait of a meeting for the lock or for a notice; a ``Waiter``."""
 
     def __init__(self, done: Callable[[bool], None]) -> None:
@@ -52,7 +52,7 @@ class Meeting:
         self._lock = lock
         self._condition = condition
         self._members = members
-        self._step: _Step | None = None
+        self._step: _MeetingStep | None = None
         self._place: int | None = None
         self._index = 0
 
@@ -95,7 +95,7 @@ class Meeting:
             finally:
                 self._lock.release()
 
-        self._step = _Step(locked)
+        self._step = _MeetingStep(locked)
         self._lock.acquire(self._step, lambda _: None)
 
     def _drop_step(self) -> None:
@@ -131,7 +131,7 @@ class Meeting:
         if self._place is None:
             self._members.places.tally(self._member, 1)
         self._place = place
-        self._step = _Step(self._notified)
+        self._step = _MeetingStep(self._notified)
         self._condition.sleep(self._step, place)
 
     def _leave(self) -> None:
