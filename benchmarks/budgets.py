@@ -228,8 +228,34 @@ def _sharing() -> Iterator[Budget]:
     }
     for case, bound in bounds.items():
         yield Budget(case, "sharing", case, sharing.CALL.name, bound)
-    case = sharing.STREAM
-    yield Budget(case, "sharing", case, sharing.RATE.name, 1.0, at_least=True)
+    case, rate, of_bytes = sharing.STREAM, sharing.RATE, sharing.BYTES
+    yield Budget(case, "sharing", case, rate.name, 1.0, at_least=True)
+    two = sharing.TWO_PRODUCERS
+    yield Budget(two, "sharing", two, of_bytes.name, 1.0, at_least=True)
+    yield from _sharing_on_loopback()
+
+
+def _sharing_on_loopback() -> Iterator[Budget]:
+    def budget(
+        case: str, metric: Metric, bound: float, *, at_least: bool = False, unit: str = ""
+    ) -> Budget:
+        return Budget(
+            f"loopback: {case}",
+            "sharing",
+            case,
+            metric.name,
+            bound,
+            at_least=at_least,
+            contender="fiber-loopback",
+            unit=unit,
+        )
+
+    rate, of_bytes, call = sharing.RATE, sharing.BYTES, sharing.CALL
+    yield budget(sharing.STREAM, rate, 50_000, at_least=True, unit=rate.unit)
+    yield budget(sharing.STREAM_OF_ARRAYS, of_bytes, 400e6, at_least=True, unit=of_bytes.unit)
+    yield budget(sharing.TWO_PRODUCERS, of_bytes, 0.5, at_least=True)
+    yield budget(sharing.MANAGER, call, 0.001, unit=call.unit)
+    yield budget(sharing.BARRIERS_OF[5], call, 0.005, unit=call.unit)
 
 
 def _start() -> Iterator[Budget]:

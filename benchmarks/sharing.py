@@ -10,6 +10,7 @@ from statistics import median
 from typing import TYPE_CHECKING, Any
 
 from benchmarks.model import Case, Metric
+from benchmarks.tasks import ones
 
 if TYPE_CHECKING:
     from benchmarks.contender import Bench
@@ -17,22 +18,27 @@ if TYPE_CHECKING:
 TITLE = "Sharing"
 ABOUT = """\
 Queue: an int goes to another process by one `Queue` and comes back by a second. A stream of 20,000
-ints comes from another process as fast as it can be read. Manager call: one `get` of a dict of
-`Manager()`. Lock, Value: `with lock`, and `with value.get_lock(): value.value += 1`, by this
-process alone, and by four processes at a time (the time divided by the number of all steps).
-Array: another process writes all of an `Array` by NumPy and says so, and this process reads all
-of it. Barrier: eight processes, this one included, wait at one barrier. Loopback agents stand for
-other hosts: with them each of these steps is a request to this process, and arrays are sent."""
+ints comes from another process as fast as it can be read. Arrays of 1 MB, and of 0.8 MB from two
+processes at a time, come by a `Queue` too, and one byte of each page is read. Manager call: one
+`get` of a dict of `Manager()`. Lock, Value: `with lock`, and
+`with value.get_lock(): value.value += 1`, by this process alone, and by four processes at a time
+(the time divided by the number of all steps). Array: another process writes all of an `Array` by
+NumPy and says so, and this process reads all of it. Barrier: five or eight processes, this one
+included, wait at one barrier. Loopback agents stand for other hosts: with them each of these steps
+is a request to this process, and arrays are sent."""
 
 CALL = Metric("call", "time of one", "s")
 RATE = Metric("rate", "items", "1/s")
+BYTES = Metric("bytes", "bytes", "B/s")
 QUEUES, CALLS, ARRAYS, BARRIERS = "queue", "lock, value, manager", "array", "barrier"
+STREAM_OF_ARRAYS = "queue, stream of 1 MB arrays"
+TWO_PRODUCERS = "queue, two producers of 0.8 MB"
 ROUND_TRIP, STREAM = "queue, round trip of an int", "queue, stream of ints"
 MANAGER, LOCK, VALUE = "manager call", "with lock", "Value += 1"
 CONTENDED = "Value += 1, four processes"
-BARRIER = "barrier of 8"
+BARRIERS_OF = {5: "barrier of 5", 8: "barrier of 8"}
 MEGABYTES = (1, 10, 100)
-_PARTIES = 8
+_PAGE = 4096
 _WRITERS = 4
 
 
@@ -46,6 +52,14 @@ def cases(size: float) -> list[Case]:
     kinds: list[tuple[str, str, Metric, dict[str, Any], int]] = [
         (QUEUES, ROUND_TRIP, CALL, {"what": "round_trip"}, 3000),
         (QUEUES, STREAM, RATE, {"what": "stream"}, 20_000),
+        (QUEUES, STREAM_OF_ARRAYS, BYTES, {"what": "arrays", "nbytes": 1_000_000}, 300),
+        (
+            QUEUES,
+            TWO_PRODUCERS,
+            BYTES,
+            {"what": "arrays", "nbytes": 800_000, "producers": 2},
+            150,
+        ),
         (CALLS, MANAGER, CALL, {"what": "manager"}, 2000),
         (CALLS, LOCK, CALL, {"what": "lock"}, 20_000),
         (CALLS, VALUE, CALL, {"what": "value"}, 20_000),
@@ -54,7 +68,10 @@ def cases(size: float) -> list[Case]:
             (ARRAYS, array(n), CALL, {"what": "array", "megabytes": n}, max(3, 100 // n))
             for n in MEGABYTES
         ),
-        (BARRIERS, BARRIER, CALL, {"what": "barrier"}, 300),
+        *(
+            (BARRIERS, name, CALL, {"what": "barrier", "parties": parties}, 300)
+            for parties, name in BARRIERS_OF.items()
+        ),
     ]
     return [
         Case(
@@ -138,6 +155,32 @@ def _stream(processes: Any, stack: ExitStack, count: int) -> dict[str, float]:
     return {RATE.name: (count - 1) / (time.perf_counter() - begin)}
 
 
+def _pour_arrays(queue: Any, go: Any, count: int, nbytes: int) -> None:
+    array = ones(nbytes)
+    go.recv()
+    for _ in range(count):
+        queue.put(array)
+    go.recv()
+
+
+def _arrays(
+    processes: Any, stack: ExitStack, count: int, nbytes: int, producers: int = 1
+) -> dict[str, float]:
+    queue = processes.Queue()
+    pipes = [processes.Pipe() for _ in range(producers)]
+    for _, there in pipes:
+        _start(processes, stack, _pour_arrays, queue, there, count, nbytes)
+    for go, _ in pipes:
+        go.send(None)
+    for _ in range(producers):
+        queue.get()
+    left = producers * (count - 1)
+    begin = time.perf_counter()
+    for _ in range(left):
+        queue.get()[::_PAGE].max()
+    return {BYTES.name: left * nbytes / (time.perf_counter() - begin)}
+
+
 def _manager(processes: Any, stack: ExitStack, count: int) -> dict[str, float]:
     shared = stack.enter_context(processes.Manager()).dict({1: 1})
     shared.get(1)
@@ -217,9 +260,9 @@ def _meet(barrier: Any, count: int) -> None:
         barrier.wait()
 
 
-def _barrier(processes: Any, stack: ExitStack, count: int) -> dict[str, float]:
-    barrier = processes.Barrier(_PARTIES)
-    for _ in range(_PARTIES - 1):
+def _barrier(processes: Any, stack: ExitStack, count: int, parties: int) -> dict[str, float]:
+    barrier = processes.Barrier(parties)
+    for _ in range(parties - 1):
         _start(processes, stack, _meet, barrier, count + 1)
     barrier.wait()
     return _median_time(barrier.wait, count)
@@ -228,6 +271,7 @@ def _barrier(processes: Any, stack: ExitStack, count: int) -> dict[str, float]:
 _MEASURES: dict[str, Callable[..., dict[str, float]]] = {
     "round_trip": _round_trip,
     "stream": _stream,
+    "arrays": _arrays,
     "manager": _manager,
     "lock": _lock,
     "value": _value,

@@ -186,6 +186,8 @@ class HubStream:
         """True while a reply is awaited or was given up."""
         self._begun: int | None = None
         """Number of the request that ``begin`` sent and ``finish`` has not read."""
+        self.place = 0
+        """Number of the place that the stream keeps in a wait list."""
         self._end = "its hub is gone"
         self._sock, to_its_hub = _dial(home)
         _streams.add(self)
@@ -222,6 +224,10 @@ class HubStream:
             raise
         self._unsettled = False
         return reply
+
+    def ask_on(self) -> Reply:
+        """Wait for a further reply to the request of ``ask``."""
+        return self._reply(self._asked, None)
 
     def begin(self, operation: Op, buffers: Sequence[memoryview]) -> None:
         """Send a request.  ``finish`` reads the reply."""

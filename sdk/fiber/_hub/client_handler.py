@@ -5,17 +5,26 @@ from __future__ import annotations
 import hmac
 import os
 import struct
+from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Protocol
 
 from fiber._hub import protocol
 from fiber._hub.heap import Block
-from fiber._hub.hosted import HostedChannel, HostedCounter, HostedSemaphore, HostedWaitList
+from fiber._hub.hosted import (
+    HostedChannel,
+    HostedCounter,
+    HostedSemaphore,
+    HostedWaitList,
+    Parts,
+)
+from fiber._hub.meetings import Meeting
 from fiber._hub.protocol import (
     FOUR,
     GRANTING,
     HEAD,
+    MEETING,
     ONE,
     SECRET,
     SECRETS,
@@ -31,6 +40,7 @@ from fiber._hub.protocol import (
 from fiber._hub.registry import Hosted, NoSuchObject, ObjectAttachment, Registry
 from fiber._hub.replicas import BlockIdentity, Replicas
 from fiber._hub.streams import NullHandler, Stream
+from fiber._wire import bundle
 from fiber._wire.packet import Message
 
 _NAME_BYTES = 80
@@ -62,7 +72,7 @@ class RequestRefused(Exception):
 class PendingRequest:
     """Request that waits for its reply, which is sent once."""
 
-    __slots__ = ("_handler", "_number", "_on_ok")
+    __slots__ = ("_handler", "_number", "_on_ok", "on_withdrawal")
 
     def __init__(
         self, handler: ClientHandler, number: int, on_ok: Callable[[], None] | None = None
@@ -70,6 +80,8 @@ class PendingRequest:
         self._handler = handler
         self._number = number
         self._on_ok = on_ok
+        self.on_withdrawal: Callable[[], None] | None = None
+        """Function to call if the request ends without a reply."""
 
     def answer(self, status: Status, value: int = 0, buffers: Sequence[memoryview] = ()) -> None:
         """Send the reply."""
@@ -103,6 +115,8 @@ class ClientHandler:
         """Number of the last request that got a token, while the client may still give it up."""
         self._place: int | None = None
         """Place of the client in the wait list of a condition."""
+        self._meeting: Meeting | None = None
+        """Last wait of the client at a barrier."""
         self._claimed = False
         """True if the counter was lowered for this client, which has not confirmed that."""
         stream.handler = self
@@ -148,6 +162,8 @@ class ClientHandler:
         self.stream.finish(reason)
 
     def _leave(self) -> None:
+        if self._meeting is not None:
+            self._meeting.abandon()
         self._cancel()
         self._give_back()
         self._unclaim()
@@ -171,6 +187,11 @@ class ClientHandler:
         request, self.waiting = self.waiting, None
         if request is not None and self._hosted is not None:
             self._hosted.withdraw(request)
+            if request.on_withdrawal is not None:
+                request.on_withdrawal()
+        meeting, self._meeting = self._meeting, None
+        if meeting is not None:
+            meeting.withdraw()
         return request
 
     def _request(
@@ -278,7 +299,11 @@ class ClientHandler:
     def cancel(self, message: Message) -> None:
         """Reply NO to the request that waits."""
         number = HEAD.unpack_from(message.payload)[1]
-        if self.waiting is not None and self.waiting.number == number:
+        if self.waiting is None or self.waiting.number != number:
+            return
+        if self._meeting is not None:
+            self._meeting.withdraw()
+        else:
             request = self._cancel()
             assert request is not None
             request.answer(Status.NO)
@@ -307,7 +332,27 @@ class ClientHandler:
         """Send a message."""
         if not message.buffers:
             raise RequestRefused("there is no message to send")
-        self._channel().send(self._request(message), message.buffers)
+        payload, *buffers = message.buffers
+        self._channel().send(self._request(message), deque([(payload, buffers)]))
+
+    def put_items(self, message: Message) -> None:
+        """Count a message or those of a bundle, reply, and send them.
+
+        When the client ends, messages that are not sent yet are dropped and no longer counted.
+        """
+        _, _, is_bundle, token = GRANTING.unpack(message.payload)
+        counter = self._checked(self._home.registry.hosted(token))
+        payload, *buffers = message.buffers
+        items: deque[Parts] = deque([(payload, buffers)])
+        if is_bundle:
+            items = deque((item, ()) for item in bundle.unpack(payload))
+        request = self._request(message)
+        counter.add(len(items))
+        self._channel().send(request, items)
+        if items and self.waiting is request:
+            self.stream.send(ONE.pack(Status.OK, request.number, 0))
+            own_count = counter.duplicate()  # the client may end its use of the counter first
+            request.on_withdrawal = lambda: own_count.lower(len(items))
 
     def recv(self, message: Message) -> None:
         """Receive a message."""
@@ -316,6 +361,11 @@ class ClientHandler:
     def draw(self, message: Message) -> None:
         """Receive a message and raise a counter."""
         granted = partial(self._counter_named_in(message).add, 1)
+        self._channel().receive(self._request(message, granted))
+
+    def get_item(self, message: Message) -> None:
+        """Receive a message and lower a counter."""
+        granted = partial(self._counter_named_in(message).lower, 1)
         self._channel().receive(self._request(message, granted))
 
     def poll(self, message: Message) -> None:
@@ -451,7 +501,7 @@ class ClientHandler:
     def enter(self, message: Message) -> None:
         """Take a place, which the stream keeps."""
         self._place = self._wait_list().places.enter(afar=True)
-        self._request(message).answer(Status.OK)
+        self._request(message).answer(Status.OK, self._place)
 
     def _own_place(self) -> int:
         if self._place is None:
@@ -485,6 +535,21 @@ class ClientHandler:
         """Note how many things the process of this stream has."""
         self._wait_list().places.hold(self._own_place(), ONE.unpack(message.payload)[2])
 
+    def tally(self, message: Message) -> None:
+        """Change how many things the process of this stream has, and word 1."""
+        self._wait_list().places.tally(self._own_place(), _signed(ONE.unpack(message.payload)[2]))
+        self._request(message).answer(Status.OK)
+
+    def meet(self, message: Message) -> None:
+        """Wait at the barrier of this wait list."""
+        _, _, lock, members, place, parties, has_action = MEETING.unpack(message.payload)
+        lock, members = map(self._home.registry.hosted, (lock, members))
+        if not isinstance(lock, HostedSemaphore) or not isinstance(members, HostedWaitList):
+            raise RequestRefused("the request is not for a barrier")
+        request = self._request(message)
+        self._meeting = Meeting(request, lock, self._wait_list(), members)
+        self._meeting.begin(place, parties, bool(has_action))
+
     def held(self, message: Message) -> None:
         """Reply with the number of things that the processes of all places have."""
         self._request(message).answer(Status.OK, self._wait_list().places.held())
@@ -502,11 +567,15 @@ class ClientHandler:
     def set(self, message: Message) -> None:
         """Set one of the user's words."""
         _, _, number, value = TWO.unpack(message.payload)
-        self._wait_list().places.set(number & 1, value - (1 << 64) if value >> 63 else value)
+        self._wait_list().places.set(number & 1, _signed(value))
         self._request(message).answer(Status.OK)
 
 
 _WORD = (1 << 64) - 1
+
+
+def _signed(word: int) -> int:
+    return word - (1 << 64) if word >> 63 else word
 
 
 class _Joining:

@@ -12,6 +12,7 @@ order.  ``HostedWaitList`` is the wait list of a condition.
 from __future__ import annotations
 
 import contextlib
+import os
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -23,7 +24,11 @@ from fiber._hub.streams import EDGE, IN, OUT, Poller
 from fiber._sync.semaphore import COUNTING, SLICE, Abandoned, SharedBlock, SharedSemaphore, warn_of
 from fiber._sync.wait_list import WaitList
 from fiber._transport.loop import Loop
+from fiber._wire.memory_files import BytesLike
 from fiber._wire.packet import INLINE_LIMIT, Message
+
+Parts = tuple[BytesLike, Sequence[memoryview]]
+"""Message of a channel: its payload and its buffers."""
 
 
 class Waiter(Protocol):
@@ -42,7 +47,7 @@ class HostedChannel:
     def __init__(self, poller: Poller, channel: LocalChannel) -> None:
         self._poller = poller
         self._channel = channel
-        self._senders: deque[tuple[Waiter, Sequence[memoryview]]] = deque()
+        self._senders: deque[tuple[Waiter, deque[Parts]]] = deque()
         self._receivers: deque[Waiter] = deque()
         self._pollers: deque[Waiter] = deque()
         self._watchers: set[Callable[[], None]] = set()
@@ -51,9 +56,12 @@ class HostedChannel:
         """Return the descriptor."""
         return self._channel.fileno()
 
-    def send(self, waiter: Waiter, parts: Sequence[memoryview]) -> None:
-        """Send payload and buffers, in the order of the requests."""
-        self._senders.append((waiter, parts))
+    def send(self, waiter: Waiter, messages: deque[Parts]) -> None:
+        """Send messages, in the order of the requests.
+
+        Messages leave ``messages`` as they are sent.  The reply follows the last one.
+        """
+        self._senders.append((waiter, messages))
         self._serve_senders()
         self._watch()
 
@@ -126,16 +134,18 @@ class HostedChannel:
 
     def _serve_senders(self) -> None:
         while self._senders:
-            waiter, parts = self._senders[0]
+            waiter, messages = self._senders[0]
             try:
-                if not self._channel.try_send(parts[0], parts[1:]):
-                    return
+                while messages:
+                    if not self._channel.try_send(*messages[0]):
+                        return
+                    messages.popleft()
             except BrokenPipeError:
                 status = Status.BROKEN
             else:
                 status = Status.OK
             self._senders.popleft()
-            waiter.answer(status)
+            waiter.answer(status, 1)
 
     def _serve_receivers(self) -> None:
         while self._receivers:
@@ -217,6 +227,14 @@ class HostedCounter:
         """Set the count to zero and return the count before."""
         return self._counter.clear()
 
+    def lower(self, n: int) -> None:
+        """Lower the count by ``n``, or to zero."""
+        self._counter.lower(n)
+
+    def duplicate(self) -> LocalCounter:
+        """Return a counter of the same count, which does not end with this one."""
+        return LocalCounter.from_fd(os.dup(self._counter.fileno()))
+
     def value(self) -> int:
         """Return the count."""
         return self._counter.value()
@@ -288,6 +306,7 @@ class HostedSemaphore:
         self._semaphore = SharedSemaphore(block, COUNTING)
         self._waiters: deque[tuple[Waiter, Callable[[bool], None]]] = deque()
         self._is_listening = False
+        self._is_serving = False
         self._revival = threading.Thread()  # none yet
 
     def acquire(self, waiter: Waiter, granted: Callable[[bool], None]) -> None:
@@ -339,6 +358,15 @@ class HostedSemaphore:
         self._stop_listening()
 
     def _serve(self) -> None:
+        if self._is_serving:  # a waiter has released its token at once; the caller goes on
+            return
+        self._is_serving = True
+        try:
+            self._serve_waiters()
+        finally:
+            self._is_serving = False
+
+    def _serve_waiters(self) -> None:
         while self._waiters and (result := self._semaphore.try_acquire()):
             waiter, granted = self._waiters.popleft()
             tracked = not self._semaphore.is_untracked()

@@ -130,6 +130,13 @@ class LocalChannel(UnixChannel):
         except BlockingIOError:
             return None
 
+    def recv_uncounting(self, counter: LocalCounter, *, wait: bool) -> Message | None:
+        """Receive a message and lower ``counter``; None if there is no message."""
+        message = self.recv() if wait else self.try_recv()
+        if message is not None:
+            counter.take(0)
+        return message
+
     @property
     def room_events(self) -> int:
         """Event of ``fileno()`` after which ``try_send`` may succeed."""
@@ -145,6 +152,11 @@ class LocalCounter(UnixCounter):
         super().__init__(owner)
         self.raising = partial(os.eventfd_write, owner.fileno(), 1)
         """``add(1)``, as a C function."""
+
+    def lower(self, n: int) -> None:
+        """Lower the count by ``n``, or to zero."""
+        for _ in range(n):
+            self.take(0)
 
     def claim(self, timeout: float | None, taken: list[Any], claims: Claimant) -> bool:
         """Take one as ``take`` does, and record it in ``claims``."""

@@ -21,7 +21,7 @@ from collections.abc import Callable
 from enum import IntEnum, IntFlag
 from typing import NamedTuple
 
-VERSION = 5
+VERSION = 6
 KEY_BYTES = 32
 
 SECRET_BYTES = 16
@@ -98,6 +98,9 @@ class Op(IntEnum):
     WATCH = 14  # silent; the stream gets READY once the channel is readable
     CHECK = 15  # NO if it is not readable now; then as WATCH
     DRAW = 16  # token of a counter -> as RECV; raises that counter by one
+    # 1 if a bundle is beside it, 0 for one message; token of a counter
+    PUT_ITEMS = 17  # -> 0 once counted, unless they are sent at once; then 1 once sent
+    GET_ITEM = 18  # token of a counter -> as RECV; lowers that counter by one
     # For an attached counter
     ADD = 20  # how much
     TAKE = 21
@@ -123,6 +126,11 @@ class Op(IntEnum):
     HOLD = 58  # number of things of the stream's process; silent
     RECLAIM = 59  # token of a counter, which is raised by -> number of things of dead processes
     HELD = 61  # -> number of things of all processes
+    TALLY = 62  # number, may be negative: the stream's process has so many more, and so has word 1
+    MEET = (
+        63  # a barrier: tokens of lock and members, place among them, parties, 1 for an action ->
+    )
+    # index; BROKEN; or NO if the process has to take the steps itself
 
 
 class Status(IntEnum):
@@ -175,6 +183,7 @@ FOUR = struct.Struct("<BIQQQQ")
 ONE = struct.Struct("<BIQ")
 SECRET = struct.Struct(f"<BI{_SECRET}")
 SECRETS = struct.Struct(f"<BI{_SECRET}{_SECRET}")
+MEETING = struct.Struct(f"<BI{_SECRET}{_SECRET}QQQ")
 GRANTING = struct.Struct(f"<BIQ{_SECRET}")
 
 

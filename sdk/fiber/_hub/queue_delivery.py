@@ -23,8 +23,9 @@ import threading
 import time
 import weakref
 from collections import deque
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, suppress
+from functools import partial
 from multiprocessing import util
 from queue import SimpleQueue
 from typing import Any
@@ -34,11 +35,11 @@ from fiber._hub import local, shared_blocks
 from fiber._hub.client import ObjectUnreachable
 from fiber._hub.handles import collecting_grants
 from fiber._hub.local import LocalChannel, LocalCounter, ReceivingEnd, SendingEnd
-from fiber._hub.remote import RemoteObject
+from fiber._hub.remote import Item, RemoteChannel, RemoteCounter, RemoteObject
 from fiber._hub.shared_blocks import AnySemaphore, AnyWaitList
 from fiber._sync.semaphore import COUNTING
 from fiber._transport.channels import Channel, SharedChannel, SharedCounter
-from fiber._wire import packet
+from fiber._wire import bundle, packet
 from fiber._wire.packet import Message
 from fiber.errors import ConnectionClosed
 
@@ -50,6 +51,10 @@ _SURPLUS_CHECK_INTERVAL = 0.2
 
 _TRANSFER_POLL_INTERVAL = 1e-4
 """Seconds between two reads of the counts while an item goes from one count to the other."""
+
+
+PutItems = Callable[[Sequence[Item]], AbstractContextManager[None]]
+"""Function that sends items.  They are counted when its context begins."""
 
 
 class QueueSlots:
@@ -95,6 +100,10 @@ class QueueSlots:
     def sent(self) -> None:
         """Note that the item was sent: its slot becomes free when it is received."""
         self._claims.drop()
+
+    def put_items(self, outbox: SharedChannel) -> PutItems | None:
+        """Return None: each item has a slot, so it is sent alone."""
+        return None
 
     def receive(self, inbox: SharedChannel, *, wait: bool) -> Message | None:
         """Receive an item and free its slot; None if there is no item."""
@@ -152,12 +161,15 @@ class ItemCount:
     def sent(self) -> None:
         """Do nothing: ``sending`` has counted the item."""
 
+    def put_items(self, outbox: SharedChannel) -> PutItems | None:
+        """Return a function that sends and counts items in one request to another host."""
+        if isinstance(outbox, RemoteChannel) and isinstance(self._sent, RemoteCounter):
+            return partial(outbox.put_items, counter=self._sent)
+        return None
+
     def receive(self, inbox: SharedChannel, *, wait: bool) -> Message | None:
         """Receive an item and lower the count; None if there is no item."""
-        message = inbox.recv() if wait else inbox.try_recv()
-        if message is not None:
-            self._sent.take(0)
-        return message
+        return inbox.recv_uncounting(self._sent, wait=wait)
 
     def used(self, waiting: int) -> int:
         """Return the number of items, of which ``waiting`` wait in this process."""
@@ -190,9 +202,10 @@ class Feeder:
         self._owner = weakref.ref(owner)
         self._outbox = outbox
         self._slots = slots
+        self._put_items = slots.put_items(outbox)
         self._on_error = on_error
         self._close_outbox = close
-        self._unsent: deque[tuple[bytes, list[memoryview]]] = deque()
+        self._unsent: deque[Item] = deque()
         # True when there are items, False at the end.
         self._wake: SimpleQueue[bool] = SimpleQueue()
         self._sending = False
@@ -280,14 +293,52 @@ class Feeder:
             more = self._wake.get()
             self._sending = True
             while self._unsent:
-                self._transfer_steps += 1
-                item = self._unsent.popleft()
-                reachable = self._count_as_sent()
-                self._transfer_steps += 1
-                if reachable:
-                    self._send(*item)
+                if self._put_items is None:
+                    self._send_next()
+                else:
+                    self._send_together(self._put_items)
             self._sending = False
         self._close_outbox()
+
+    def _send_next(self) -> None:
+        self._transfer_steps += 1
+        item = self._unsent.popleft()
+        reachable = self._count_as_sent()
+        self._transfer_steps += 1
+        if reachable:
+            self._send(*item)
+
+    def _send_together(self, put_items: PutItems) -> None:
+        """Send the next items in one request: a large one, or small ones.
+
+        While a request is on its way, further items gather for the next one.
+        """
+        self._transfer_steps += 1
+        counted = False
+        items = self._take_next()
+        try:
+            with put_items(items):
+                self._transfer_steps += 1
+                counted = True
+        except (BrokenPipeError, EOFError):
+            self._unsent.clear()  # no process can ever read them
+        except OSError as error:
+            for _ in items:
+                self._report(error)
+        if not counted:
+            self._transfer_steps += 1
+
+    def _take_next(self) -> list[Item]:
+        """Take the next item, and as many more as a bundle holds."""
+        items = [self._unsent.popleft()]
+        room = bundle.LIMIT - packet.size_of(*items[0])
+        while self._unsent and not items[0][1]:
+            payload, buffers = self._unsent[0]
+            room -= len(payload)
+            if buffers or room < 0:
+                break
+            items.append(self._unsent.popleft())
+        return items
 
     def _count_as_sent(self) -> bool:
         """Count an item as sent; False if the count is gone, and the queue with it."""
@@ -310,6 +361,9 @@ class Feeder:
     def _failed(self, error: OSError) -> None:
         self._slots.not_sent()
         self._slots.give_back()
+        self._report(error)
+
+    def _report(self, error: OSError) -> None:
         if util.is_exiting():
             util.info("error in queue thread: %s", error)
         else:

@@ -19,6 +19,7 @@ from typing import Any, TypeAlias
 
 from fiber._hub.client import HubStream, ObjectUnreachable, Reply
 from fiber._hub.protocol import (
+    GRANTING,
     HEAD,
     NO_SECRET,
     ONE,
@@ -32,7 +33,7 @@ from fiber._hub.protocol import (
     Status,
 )
 from fiber._transport.channels import Claimant, wait_readable
-from fiber._wire import packet
+from fiber._wire import bundle, packet
 from fiber._wire.memory_files import BytesLike
 from fiber._wire.packet import Message
 from fiber.errors import ConnectionClosed
@@ -159,6 +160,10 @@ class RemoteObject:
         """Handle the late reply to a request that was given up (Ctrl-C)."""
 
 
+Item: TypeAlias = tuple[bytes, list[memoryview]]
+"""Item of a queue: its pickle, and the buffers beside it."""
+
+
 class RemoteChannel(RemoteObject):
     """End of a message pipe on another host; a ``SharedChannel``."""
 
@@ -233,6 +238,30 @@ class RemoteChannel(RemoteObject):
         """Receive a message, and have the hub raise ``counter``; None if there is no message."""
         timeout = None if wait else 0
         return self._receive(Op.DRAW, counter.known(), form=SECRET, timeout=timeout)
+
+    def recv_uncounting(self, counter: RemoteCounter, *, wait: bool) -> Message | None:
+        """Receive a message, and have the hub lower ``counter``; None if there is no message."""
+        timeout = None if wait else 0
+        return self._receive(Op.GET_ITEM, counter.known(), form=SECRET, timeout=timeout)
+
+    @contextmanager
+    def put_items(self, items: Sequence[Item], counter: RemoteCounter) -> Iterator[None]:
+        """Send one message, or several without buffers; the hub raises ``counter`` accordingly.
+
+        They are counted when the context begins, and can be received when it ends.
+        """
+        token = counter.known()
+        with _naming_the_end(), self.stream() as stream:
+            if is_bundle := len(items) > 1:
+                parts = [memoryview(bundle.pack(payload for payload, _ in items))]
+            else:
+                ((payload, buffers),) = items
+                parts = [memoryview(payload), *buffers]
+            reply = stream.ask(Op.PUT_ITEMS, is_bundle, token, form=GRANTING, buffers=parts)
+            yield
+            if reply.status is Status.OK and not reply.values[0]:
+                reply = stream.ask_on()
+            _check_sent(reply)
 
     def _receive(
         self,

@@ -110,6 +110,9 @@ class SharedChannel(Channel, Protocol):
         no message.
         """
 
+    def recv_uncounting(self, counter: Any, *, wait: bool) -> Message | None:
+        """Receive a message, then lower ``counter``; None if there is no message."""
+
 
 class Claimant(Protocol):
     """Record of how many units of a counter a process holds.
