@@ -14,8 +14,8 @@ from pathlib import Path
 
 from benchmarks import machine, processes
 from benchmarks.contenders import BY_NAME, Contender
-from benchmarks.model import Run
-from benchmarks.paper import page, pictures
+from benchmarks.model import Case, Run
+from benchmarks.paper import packages, page, pictures
 from benchmarks.paper.packages import Missing
 from benchmarks.paper.parts import PARTS, Part, contenders_of, has_cluster
 from benchmarks.paper.recording import BadRecording
@@ -25,14 +25,15 @@ from benchmarks.session import ROOT
 _ROUNDS = 3
 _QUICK_SIZE = 0.005
 _MINUTES = 15.0
+_WALKER = "walker"
 _PODS = "fiber-kubernetes"
 
 
 def main(arguments: Sequence[str]) -> int:
     """Return 0 if all parts ran; 1 if one failed or something is missing; 130 after Ctrl-C."""
     options = _parse(arguments)
-    parts = [PARTS[name] for name in options.only]
-    if problems := _problems(parts, options.contenders):
+    parts = [PARTS[name] for name in options.only if name != _WALKER]
+    if problems := _problems(parts, options):
         for each in problems:
             say(each)
         return 1
@@ -42,7 +43,7 @@ def main(arguments: Sequence[str]) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         new = {part.name: _measure(part, options, command) for part in parts}
-        if "evolution" in new:
+        if _WALKER in options.only:
             _walk(options)
     except KeyboardInterrupt:
         say("interrupted: no page is written")
@@ -53,15 +54,18 @@ def main(arguments: Sequence[str]) -> int:
     return int(any(name.startswith("fiber") for name in failed))
 
 
-def _problems(parts: Sequence[Part], chosen: list[str] | None) -> list[str]:
+def _problems(parts: Sequence[Part], options: argparse.Namespace) -> list[str]:
     """Return a line for each thing that is missing, before anything is measured."""
     found = []
-    for part in parts:
+    checks = [part.check for part in parts]
+    if _WALKER in options.only:
+        checks.append(lambda: packages.walker(packages.WALKER).close())
+    for check in checks:
         try:
-            part.check()
+            check()
         except (Missing, BadRecording) as error:
             found.append(str(error))
-    if _PODS in (chosen or []) and not has_cluster():
+    if _PODS in (options.contenders or []) and not has_cluster():
         found.append(
             f'{_PODS} needs a cluster: set KUBECONFIG and FIBER_IMAGE, or run eval "$(make -s '
             'cluster)" first'
@@ -76,11 +80,18 @@ def _measure(part: Part, options: argparse.Namespace, command: str) -> Run:
     with scratch_folder() as scratch:
         rounds = Rounds(scratch, {part.measure: run})
         try:
-            rounds.play(part.cases(options.size), able, options.rounds)
+            rounds.play(_chosen(part.cases(options.size), options.workers), able, options.rounds)
         finally:
             rounds.abandon()
     run.about["load after"] = round(os.getloadavg()[0], 2)
     return run
+
+
+def _chosen(cases: Sequence[Case], workers: list[int] | None) -> list[Case]:
+    """Return the cases with these numbers of workers, and those whose number is not varied."""
+    return [
+        case for case in cases if workers is None or case.params.get("workers") in (None, *workers)
+    ]
 
 
 def _able(contenders: Sequence[Contender]) -> tuple[list[Contender], dict[str, str]]:
@@ -110,9 +121,13 @@ def _parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         "benchmarks.paper", description="Make the figures of the paper, with the peers beside them."
     )
-    parser.add_argument("--only", nargs="+", choices=list(PARTS), default=list(PARTS))
+    every = [*PARTS, _WALKER]
+    parser.add_argument("--only", nargs="+", choices=every, default=every, help="default: all")
     parser.add_argument(
         "--contenders", type=_names, metavar="A,B", help="default: all that a part has"
+    )
+    parser.add_argument(
+        "--workers", type=_numbers, metavar="N,M", help="default: all numbers that a part has"
     )
     parser.add_argument("--rounds", type=_count, help=f"default {_ROUNDS}; 1 with --quick")
     parser.add_argument("--size", type=_share, help="share of the full amount of work, default 1")
@@ -139,6 +154,10 @@ def _names(text: str) -> list[str]:
             there = ", ".join(each for each in BY_NAME if each in known)
             raise argparse.ArgumentTypeError(f"no contender {name!r}; there are {there}")
     return names
+
+
+def _numbers(text: str) -> list[int]:
+    return [_count(each) for each in text.split(",")]
 
 
 def _count(text: str) -> int:

@@ -33,10 +33,16 @@ PARAMETERS = 2804
 """Parameters of a policy with 40 units in each of two hidden layers, as in the paper's domain."""
 NOISE = 1 << 20
 SIGMA, RATE = 0.1, 0.01
-PEERS_WORKERS_PER_PROCESSOR = 32
 _QUICK_WORKERS = (4, 8)
 _QUICK_POPULATION = 64
-_SERVERS = ("ipyparallel", "ray", "dask")
+# A peer's worker is an interpreter that imports the library; the others' are forked.
+_MOST_A_PROCESSOR = {
+    "fiber": 128,
+    "multiprocessing": 128,
+    "ipyparallel": 32,
+    "ray": 32,
+    "dask": 32,
+}
 
 TIME = Metric("time", "time of all iterations", "s")
 BOUND = Metric("bound", "bound of list scheduling", "s")
@@ -77,12 +83,13 @@ def cases(size: float) -> list[Case]:
 
 
 def _too_many(count: int) -> dict[str, str]:
-    """Return the peers that need an interpreter with imports of their own for each worker, if they
-    are too many for this machine."""
-    most = PEERS_WORKERS_PER_PROCESSOR * len(os.sched_getaffinity(0))
-    if count <= most:
-        return {}
-    return dict.fromkeys(_SERVERS, f"{count:,} interpreters do not start on this machine in time")
+    """Return the contenders that need more processes for so many workers than fit this machine."""
+    processors = len(os.sched_getaffinity(0))
+    return {
+        name: f"{count:,} processes do not fit this machine"
+        for name, most in _MOST_A_PROCESSOR.items()
+        if count > most * processors
+    }
 
 
 def population_of(iteration: int, population: int) -> list[Job]:

@@ -239,7 +239,7 @@ def test_a_wrong_argument_is_refused(
     ("part", "module", "install"),
     [
         ("breakout", "ale_py", "ale-py"),
-        ("evolution", "gymnasium", "gymnasium[box2d]"),
+        ("walker", "gymnasium", "gymnasium[box2d]"),
     ],
 )
 def test_a_missing_package_is_one_line(
@@ -265,10 +265,12 @@ def test_a_missing_cluster_is_one_line(
     assert "needs a cluster: set KUBECONFIG and FIBER_IMAGE" in line
 
 
-def test_peers_leave_out_more_workers_than_the_machine_starts() -> None:
-    last = evolution.cases(1.0)[-1]
-    assert set(last.not_run) == {"ipyparallel", "ray", "dask"}
-    assert not evolution.cases(0.001)[0].not_run
+def test_contenders_leave_out_more_processes_than_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: {0, 1})
+    out = {case.params["workers"]: set(case.not_run) for case in evolution.cases(0.02)}
+    assert not out[64]
+    assert out[128] == out[256] == {"ipyparallel", "ray", "dask"}
+    assert out[2048] == out[512] == {*out[128], "fiber", "multiprocessing"}
 
 
 def test_pods_take_part_where_a_cluster_is(monkeypatch: pytest.MonkeyPatch) -> None:
