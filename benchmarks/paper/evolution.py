@@ -74,7 +74,7 @@ def cases(size: float) -> list[Case]:
             needs="evolution",
             params={"workers": count, "iterations": iterations, "population": population},
             metrics=(TIME, BOUND),
-            limit=120.0 + 3 * bound(iterations, population, count),
+            limit=300.0 + 3 * bound(iterations, population, count),
             fresh=True,
             not_run=_too_many(count),
         )
