@@ -84,8 +84,25 @@ def run(bench: Bench, kind: str, workers: int, steps: int) -> dict[str, float]:
 
 def _vector(contender: str, make: Callable[[], Any], workers: int) -> Any:
     if contender.startswith("fiber") and contender != "fiber-adopted":
-        return import_module("fiber.vector").VecEnv([make] * workers, num_workers=workers)
+        return _VectorEnv(make, workers)
     if contender == "fiber-adopted":
         import_module("fiber").adopt(SUBPROC_MODULE)
     vec_env = import_module("stable_baselines3.common.vec_env")
     return vec_env.SubprocVecEnv([make] * workers, start_method="fork")
+
+
+class _VectorEnv:
+    """`fiber.vector.VectorEnv` with the results of SubprocVecEnv, without importing torch."""
+
+    def __init__(self, make: Callable[[], Any], workers: int) -> None:
+        vector = import_module("fiber.vector")
+        self._envs = vector.VectorEnv([make] * workers, num_workers=workers)
+        self.close = self._envs.close
+
+    def reset(self) -> Any:
+        observations, _ = self._envs.reset()
+        return observations
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any]:
+        observations, rewards, terminated, truncated, infos = self._envs.step(actions)
+        return observations, rewards, terminated | truncated, infos

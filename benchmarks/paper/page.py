@@ -147,11 +147,16 @@ def _times(run: Run, case: Case, name: str, other: str) -> str:
 
 def _text(run: Run, table: str, note: str = "") -> str:
     shares = ", ".join(f"{100 * share:.0f} %" for share in run.in_use)
-    how = (
-        f"Median of at most {run.about['rounds']} rounds. {note} Before the rounds, other programs "
-        f"used {shares} of the processors' time; the load was {run.about['load']:g} at the "
-        f"beginning and {run.about['load after']:g} at the end."
-    ).replace("  ", " ")
+    sentences = [
+        f"Median of at most {run.about['rounds']} rounds.",
+        note,
+        f"Before the rounds, other programs used {shares} of the processors' time."
+        if shares
+        else "",
+        f"The load was {run.about['load']:g} at the beginning and {run.about['load after']:g} at "
+        "the end.",
+    ]
+    how = " ".join(each for each in sentences if each)
     parts = [table, how, _failures(run), report.origin(run.about)]
     return "\n\n".join(part for part in parts if part)
 
