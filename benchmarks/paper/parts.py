@@ -16,7 +16,7 @@ SHORTEST = 0.001
 
 @dataclass(frozen=True)
 class Part:
-    """One figure of the paper. `check` raises if something is missing that all contenders need."""
+    """Figure of the paper. `check` raises if something is missing that all contenders need."""
 
     name: str
     measure: str
