@@ -118,7 +118,8 @@ def run(bench: Bench, workers: int, iterations: int, population: int) -> dict[st
     """Return seconds of all iterations, after one that starts all workers, and their bound."""
     jobs = [population_of(iteration, population) for iteration in range(iterations)]
     with _pool(bench.contender, workers) as pool, _noise_table() as table:
-        _, theta = _warm(pool, table, workers), _zeros()
+        _warm(pool, table, workers)
+        theta = _zeros()
         begin = time.perf_counter()
         for each in jobs:
             theta = _iteration(pool, theta, table, each)

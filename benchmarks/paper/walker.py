@@ -48,7 +48,7 @@ FIRST_TEST_SEED = 2**31
 class Scale(NamedTuple):
     """Sums over observations, from which their mean and deviation follow."""
 
-    count: float
+    number: float
     total: Array
     squares: Array
 
@@ -58,8 +58,8 @@ class Scale(NamedTuple):
 
     def mean_and_deviation(self) -> tuple[Array, Array]:
         """Return what observations are shifted and divided by."""
-        mean = self.total / self.count
-        return mean, np.sqrt(np.maximum(self.squares / self.count - mean**2, 1e-4))
+        mean = self.total / self.number
+        return mean, np.sqrt(np.maximum(self.squares / self.number - mean**2, 1e-4))
 
 
 NOTHING_SEEN = Scale(1.0, np.zeros(OBSERVED), np.ones(OBSERVED))

@@ -16,6 +16,7 @@ sys.path.insert(0, str(ROOT))
 
 from benchmarks import fake_agents, tasks  # noqa: E402
 from benchmarks.paper import (  # noqa: E402
+    atari,
     breakout,
     command,
     evolution,
@@ -197,7 +198,7 @@ def test_the_policy_learns_the_action_that_pays() -> None:
 
 
 def test_a_frame_is_reduced_to_means() -> None:
-    frames = np.zeros((2, ppo.SIDE, ppo.SIDE, 1), np.uint8)
+    frames = np.zeros((2, atari.SIDE, atari.SIDE, 1), np.uint8)
     frames[1, :4, 4:8] = 255
     means = ppo.reduced(frames)
     assert means.shape == (2, ppo.FEATURES // 2)
