@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import json
 import os
 import subprocess
@@ -44,7 +45,9 @@ def scratch() -> Iterator[Path]:
 @pytest.mark.timeout(5 * PATIENCE)  # ten seconds of work on a quiet machine
 def test_a_tiny_run(part: str, tmp_path: Path, scratch: Path) -> None:
     for module in NEEDS[part]:
-        pytest.importorskip(module)
+        # Not imported: stable-baselines3 would import torch, which a contender replaces.
+        if importlib.util.find_spec(module) is None:
+            pytest.skip(f"{module} is not installed")
     arguments = ["--only", *PARTS[part], "--contenders", ",".join(CONTENDERS[part]), "--quick"]
     done = subprocess.run(
         [sys.executable, "-m", "benchmarks.paper", *arguments, "--output", str(tmp_path)],
