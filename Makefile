@@ -22,7 +22,7 @@ unexport PYTHONDONTWRITEBYTECODE
 CLUSTER := PYTHONPATH=tests $(BIN)/python -m cluster
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-fast test-pythons test-long e2e lint bench bench-operator bench-kubernetes conformance conformance-original published crds docs pictures images cluster cluster-down release release-prepare release-dry-run clean
+.PHONY: help demo test test-fast test-pythons test-long e2e lint bench bench-operator bench-kubernetes paper conformance conformance-original published crds docs pictures images cluster cluster-down release release-prepare release-dry-run clean
 
 help:
 	@sed -n 's/^## //p' $(MAKEFILE_LIST)
@@ -32,7 +32,7 @@ demo: $(VENV)/.with-rl
 	$(BIN)/python examples/02-es/main.py
 
 ## make test          every test; all parts run, and the last lines name those that failed
-test: $(VENV)/.with-dev $(VENV)/.with-stable-baselines3 $(VENV)/.with-jax $(VENV)/.with-testsuite $(VENV)/.with-browser
+test: $(VENV)/.with-dev $(VENV)/.with-stable-baselines3 $(VENV)/.with-jax $(VENV)/.with-games $(VENV)/.with-testsuite $(VENV)/.with-browser
 	@PYTHONPATH=tests $(BIN)/python -m announcement $(OTHER_PYTHONS)
 	@failed=; \
 	for part in $(PARTS); do $(MAKE) --no-print-directory $$part || failed="$$failed $$part"; done; \
@@ -109,6 +109,10 @@ bench-operator: $(VENV)/.with-dev
 bench-kubernetes: $(VENV)/.with-bench $(VENV)/.with-dev
 	PYTHONPATH=tests $(BIN)/python -m benchmarks.kubernetes_cluster
 	$(BIN)/python -m benchmarks.relay_memory
+
+## make paper         the paper's experiments beside the peers; writes docs/paper.md and docs/paper
+paper: $(VENV)/.with-bench $(VENV)/.with-stable-baselines3 $(VENV)/.with-games
+	$(BIN)/python -m benchmarks.paper
 
 ## make conformance   CPython's tests of multiprocessing and executors, joblib's (BACKEND=local, loopback or kubernetes)
 conformance: $(VENV)/.with-dev $(VENV)/.with-testsuite
@@ -203,6 +207,12 @@ $(VENV)/.with-vector-peers: $(VENV)/.with-bench
 	-$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps 'stable-baselines3>=2.4'
 	-$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps 'pufferlib-core>=3'
 	-$(BIN)/python -m pip install --quiet --disable-pip-version-check --only-binary :all: 'envpool>=1.2'
+	touch $@
+
+# Real environments of the paper's experiments: Box2D, and Atari's emulator with its games. Where
+# they have no wheel, their tests are skipped.
+$(VENV)/.with-games: $(VENV)/.with-dev
+	-$(BIN)/python -m pip install --quiet --disable-pip-version-check --only-binary :all: 'gymnasium[box2d]>=1.0' 'ale-py>=0.10'
 	touch $@
 
 $(VENV)/.with-testsuite: $(VENV)/.made

@@ -16,6 +16,8 @@ _GUARDED = frozenset({"guarded endings"})
 VECTOR = frozenset({"vector steps", "cart poles"})
 FIRST_READY = frozenset({"first ready"})
 _WITH_JAX = frozenset({"start with jax"})
+EVOLUTION = frozenset({"evolution"})
+PPO = frozenset({"ppo"})
 _AGAINST_BASELINE = frozenset({"placed pipes", "agents", "import"})
 
 
@@ -73,6 +75,8 @@ ALL = (
         | _AGAINST_BASELINE
         | VECTOR
         | FIRST_READY
+        | EVOLUTION
+        | PPO
         | {"fake workers"},
         "#0072B2",
         "o",
@@ -82,7 +86,7 @@ ALL = (
         "fiber-loopback",
         "Fiber, loopback agents",
         ("fiber",),
-        _POOL | _PROCESSES | _GUARDED | _WITH_JAX | VECTOR | FIRST_READY,
+        _POOL | _PROCESSES | _GUARDED | _WITH_JAX | VECTOR | FIRST_READY | PPO,
         "#56B4E9",
         "s",
         environment={"FIBER_BACKEND": "loopback"},
@@ -126,7 +130,7 @@ ALL = (
         "multiprocessing",
         "multiprocessing, fork",
         (),
-        _POOL | _PROCESSES | _AGAINST_BASELINE,
+        _POOL | _PROCESSES | _AGAINST_BASELINE | EVOLUTION,
         "#000000",
         "D",
     ),
@@ -162,13 +166,23 @@ ALL = (
         "dask",
         "Dask",
         ("distributed", "dask.bag"),
-        _CLIENT | {"executor"},
+        _CLIENT | EVOLUTION | {"executor"},
         "#E69F00",
         "<",
         servers=True,
     ),
-    Contender("ipyparallel", "ipyparallel", ("ipyparallel",), _POOL, "#CC79A7", ">", servers=True),
-    Contender("ray", "Ray's Pool", ("ray",), _POOL | EXECUTOR, "#D55E00", "P", servers=True),
+    Contender(
+        "ipyparallel",
+        "ipyparallel",
+        ("ipyparallel",),
+        _POOL | EVOLUTION,
+        "#CC79A7",
+        ">",
+        servers=True,
+    ),
+    Contender(
+        "ray", "Ray's Pool", ("ray",), _POOL | EXECUTOR | EVOLUTION, "#D55E00", "P", servers=True
+    ),
     Contender(
         "spark",
         "PySpark",
@@ -185,7 +199,7 @@ ALL = (
         "stable-baselines3",
         "SubprocVecEnv",
         ("stable_baselines3",),
-        VECTOR,
+        VECTOR | PPO,
         "#E69F00",
         "H",
         by_name=("torch",),
@@ -215,7 +229,7 @@ ON_PODS = Contender(
     "fiber-kubernetes",
     "Fiber, pods",
     ("fiber", "kubernetes"),
-    _POOL | _PROCESSES | VECTOR | FIRST_READY,
+    _POOL | _PROCESSES | VECTOR | FIRST_READY | EVOLUTION | PPO,
     "#117733",
     "*",
     environment={"FIBER_BACKEND": "kubernetes"},
@@ -240,4 +254,28 @@ EXECUTOR_ON_PODS = Contender(
 )
 """Contenders that take part where a cluster is: see kubernetes_run.py."""
 
-BY_NAME = {contender.name: contender for contender in (*ALL, ON_PODS, RELAYED, EXECUTOR_ON_PODS)}
+ON_HOSTS = Contender(
+    "fiber-hosts",
+    "Fiber, 8 workers a host",
+    ("fiber",),
+    EVOLUTION,
+    "#56B4E9",
+    "s",
+    environment={"FIBER_BACKEND": "local"},
+)
+ADOPTED = Contender(
+    "fiber-adopted",
+    "SubprocVecEnv, adopted",
+    ("fiber", "stable_baselines3"),
+    PPO,
+    "#009E73",
+    "s",
+    environment={"FIBER_BACKEND": "local"},
+    by_name=("torch",),
+)
+"""Contenders of the paper's experiments: see the package `paper`."""
+
+BY_NAME = {
+    contender.name: contender
+    for contender in (*ALL, ON_PODS, RELAYED, EXECUTOR_ON_PODS, ON_HOSTS, ADOPTED)
+}

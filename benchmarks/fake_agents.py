@@ -3,15 +3,20 @@
 A `FakeAgent` is an `AgentHandle` whose children live in the process of the agent itself. The
 master's work for them, and the messages to and from them, are real, but the children cost next to
 nothing. They run their tasks by the code of a real worker, one after the other on the loop's
-thread. Only this module, `agent_host` and `fake_cluster` know Fiber's inner parts.
+thread. A task that calls `tasks.pretend` keeps its child busy for so long, and the loop free: the
+child's answer and its next task wait. Only this module, `agent_host` and `fake_cluster` know
+Fiber's inner parts.
 """
 
 from __future__ import annotations
 
 import itertools
 import pickle
+from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
+
+from benchmarks import tasks
 
 from fiber._agent.interface import ChildObserver, ChildSpec, ExitReport
 from fiber._agent.worker import BatchRunner
@@ -19,6 +24,8 @@ from fiber._transport.loop import Loop
 from fiber._wire import work
 from fiber._wire.memory_files import BytesLike
 from fiber._wire.packet import Message
+
+Answer = tuple[bytes, Sequence[memoryview]]
 
 _READY = pickle.dumps((work.READY,))
 _BOARD = 24
@@ -85,6 +92,8 @@ class FakeChild:
         self._agent = agent
         self._observer = observer
         self._gone = False
+        self._busy = False
+        self._unread: deque[tuple[int, Message]] = deque()
 
     def start(self) -> None:
         """Do nothing: the child will be ready by itself."""
@@ -102,7 +111,8 @@ class FakeChild:
 
     def deliver(self, seq: int, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
         """Run the batch at the loop's next turn, or end."""
-        self._agent.loop.call_soon(self._run, work.SEQ.pack(seq) + bytes(payload), list(buffers))
+        message = Message(memoryview(work.SEQ.pack(seq) + bytes(payload)), list(buffers), [])
+        self._agent.loop.call_soon(self._receive, seq, message)
         return True
 
     def lease_channel(self) -> None:
@@ -112,8 +122,8 @@ class FakeChild:
         """Return None: this worker is never leased."""
 
     def recall(self) -> None:
-        """Return no tasks: the worker has run what was delivered, or is about to."""
-        self._agent.loop.call_soon(self._observer.recalled, [])
+        """Take back the batches that the child has not begun."""
+        self._agent.loop.call_soon(self._recall)
 
     def measure(self) -> None:
         """Do nothing."""
@@ -126,11 +136,38 @@ class FakeChild:
         """Give the worker's packets to its observer: a worker's `Sender`."""
         self._observer.received(Message(memoryview(payload), list(buffers), []))
 
-    def _run(self, payload: bytes, buffers: list[memoryview]) -> None:
-        if not self._gone and not self._agent.runner.run(
-            self, Message(memoryview(payload), buffers, [])
-        ):
-            self._end(ExitReport(0, "exit status 0"))
+    def _receive(self, seq: int, message: Message) -> None:
+        self._unread.append((seq, message))
+        if not self._busy:
+            self._run()
+
+    def _run(self) -> None:
+        """Run what was delivered, until a task keeps the child busy."""
+        while self._unread and not self._gone:
+            _, message = self._unread.popleft()
+            answers, seconds, goes_on = self._agent.runner.run(message)
+            if seconds:
+                self._busy = True
+                self._agent.loop.call_later(seconds, self._done, answers)
+                return
+            self._answer(answers)
+            if not goes_on:
+                self._end(ExitReport(0, "exit status 0"))
+
+    def _done(self, answers: list[Answer]) -> None:
+        self._busy = False
+        if not self._gone:
+            self._answer(answers)
+            self._run()
+
+    def _answer(self, answers: list[Answer]) -> None:
+        for payload, buffers in answers:
+            self.send(payload, buffers)
+
+    def _recall(self) -> None:
+        seqs = [seq for seq, _ in self._unread]
+        self._unread.clear()
+        self._observer.recalled(seqs)
 
     def _end(self, report: ExitReport) -> None:
         if not self._gone:
@@ -145,15 +182,21 @@ class TaskRunner:
     """
 
     def __init__(self) -> None:
-        self._child: FakeChild | None = None
+        self._answers: list[Answer] = []
+        self._seconds = 0.0
         self._worker = BatchRunner(self, memoryview(bytearray(_BOARD)).cast("Q"))
+        tasks.pretend = self._pretend
 
-    def run(self, child: FakeChild, message: Message) -> bool:
-        """Run and answer for this child; False if it was asked to stop."""
-        self._child = child
-        return self._worker.handle(message)
+    def run(self, message: Message) -> tuple[list[Answer], float, bool]:
+        """Run a message. Return the answers, the seconds that its tasks would take, and False if it
+        asks the worker to stop."""
+        self._answers, self._seconds = [], 0.0
+        goes_on = self._worker.handle(message)
+        return self._answers, self._seconds, goes_on
 
     def send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
-        """Send the worker's answer as that of the child whose turn it is."""
-        assert self._child is not None
-        self._child.send(bytes(payload), buffers)
+        """Keep an answer of the worker for the child whose turn it is."""
+        self._answers.append((bytes(payload), buffers))
+
+    def _pretend(self, seconds: float) -> None:
+        self._seconds += seconds

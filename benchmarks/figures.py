@@ -44,12 +44,12 @@ def _overhead(run: Run, path: Path) -> None:
             (duration, overhead.case_name(duration, chunks)) for duration in overhead.DURATIONS
         ]
         panel.axhline(run.about["size"], color="#bbbbbb", linestyle="--", zorder=0)
-        _lines(panel, run, points, overhead.TIME)
+        lines(panel, run, points, overhead.TIME)
         panel.invert_xaxis()
         panel.set(title=chunks[0].upper() + chunks[1:], xlabel="duration of a task")
-        _unit(panel.xaxis, "s", list(overhead.DURATIONS))
+        unit(panel.xaxis, "s", list(overhead.DURATIONS))
     panels[0].set_ylabel("time to finish (dashed: no overhead; ✗: not finished)")
-    _finish(figure, path)
+    finish(figure, path)
 
 
 def _throughput(run: Run, path: Path) -> None:
@@ -60,7 +60,7 @@ def _throughput(run: Run, path: Path) -> None:
     panels[0].set(title="No-op tasks: further right is better", xlabel="tasks a second")
     _rows(panels[1], run, [name for name in names if name not in rates], throughput.TIME)
     panels[1].set(title="Batches: further left is better", xlabel="time of the batch")
-    _finish(figure, path)
+    finish(figure, path)
 
 
 def _latency(run: Run, path: Path) -> None:
@@ -88,8 +88,8 @@ def _latency(run: Run, path: Path) -> None:
         xlabel="time of one apply: p50 (marker) to p95 (bar)",
     )
     panel.invert_yaxis()
-    _unit(panel.xaxis, "s")
-    _finish(figure, path, legend=False)
+    unit(panel.xaxis, "s")
+    finish(figure, path, legend=False)
 
 
 def _pipes(run: Run, path: Path) -> None:
@@ -100,7 +100,7 @@ def _pipes(run: Run, path: Path) -> None:
         cases = [pipes.placed(name, place) for name in messages]
         _pipe_panel(panel, run, messages, cases, f"on {place}")
     steps = [case.name for case in pipes.cases(run.about["size"]) if case.group == pipes.STEPS]
-    _lines(panels[1, 1], run, list(enumerate(steps)), pipes.STEP, log_x=False)
+    lines(panels[1, 1], run, list(enumerate(steps)), pipes.STEP, log_x=False)
     panels[1, 1].set(
         title="One step of Gymnasium's AsyncVectorEnv",
         ylabel="time",
@@ -108,7 +108,7 @@ def _pipes(run: Run, path: Path) -> None:
         xticklabels=steps,
         xlim=(-0.5, len(steps) - 0.5),
     )
-    _finish(figure, path)
+    finish(figure, path)
 
 
 def _sharing(run: Run, path: Path) -> None:
@@ -120,13 +120,13 @@ def _sharing(run: Run, path: Path) -> None:
     panels[0].set(title="Calls: further left is better", xlabel="time of one")
     _rows(panels[1], run, arrays, sharing.CALL)
     panels[1].set(title="Arrays, written there and read here", xlabel="time of one")
-    _finish(figure, path)
+    finish(figure, path)
 
 
 def _pipe_panel(
     panel: Any, run: Run, messages: Sequence[str], cases: Sequence[str], where: str
 ) -> None:
-    _lines(panel, run, list(enumerate(cases)), pipes.ROUND_TRIP, log_x=False)
+    lines(panel, run, list(enumerate(cases)), pipes.ROUND_TRIP, log_x=False)
     panel.set(
         title=f"Round trip through a Pipe, {where}",
         xlabel="message",
@@ -142,13 +142,13 @@ def _vector(run: Run, path: Path) -> None:
     *panels, spare = grid.flat
     for panel, (ending, title) in zip(panels, vector.PANELS.items(), strict=True):
         points = [(float(count), f"{count:,} {ending}") for count in vector.COUNTS]
-        _lines(panel, run, points, vector.RATE)
+        lines(panel, run, points, vector.RATE)
         panel.set(title=title[0].upper() + title[1:], xlabel="environments", xticks=vector.COUNTS)
-        _counts(panel.xaxis)
+        counts(panel.xaxis)
     for panel in (grid[0, 0], grid[1, 0]):
         panel.set_ylabel("environment steps a second (✗: not finished)")
     spare.set_axis_off()
-    _finish(figure, path)
+    finish(figure, path)
 
 
 def _executors(run: Run, path: Path) -> None:
@@ -163,7 +163,7 @@ def _rates(run: Run, path: Path, cases: Sequence[Case], rate: Metric, *, height:
     figure, panel = plt.subplots(figsize=(10, height))
     _rows(panel, run, [case.name for case in cases], rate)
     panel.set(title="Further right is better", xlabel="tasks a second")
-    _finish(figure, path)
+    finish(figure, path)
 
 
 def _startup(run: Run, path: Path) -> None:
@@ -174,10 +174,10 @@ def _startup(run: Run, path: Path) -> None:
         (panels[1], startup.MEMORY, "Memory of all of them"),
         (panels[2], startup.STOP, "Until all are gone"),
     ):
-        _lines(panel, run, points, metric)
+        lines(panel, run, points, metric)
         panel.set(title=title, xlabel="workers", xticks=startup.WORKERS, xlim=(0.7, 1500))
-        _counts(panel.xaxis)
-    _finish(figure, path)
+        counts(panel.xaxis)
+    finish(figure, path)
 
 
 def _coldstart(run: Run, path: Path) -> None:
@@ -189,7 +189,7 @@ def _coldstart(run: Run, path: Path) -> None:
     ):
         _rows(panel, run, names, metric)
         panel.set(title=title, xlabel="time since the interpreter was started")
-    _finish(figure, path)
+    finish(figure, path)
 
 
 def _jax_start(run: Run, path: Path) -> None:
@@ -198,27 +198,27 @@ def _jax_start(run: Run, path: Path) -> None:
     for panel, metric in zip(panels, (jax_start.FIRST, jax_start.SECOND), strict=True):
         _rows(panel, run, names, metric)
         panel.set(title=f"The {metric.label} of a program", xlabel="time to its first map")
-    _finish(figure, path)
+    finish(figure, path)
 
 
 def _workers(run: Run, path: Path) -> None:
     figure, panel = plt.subplots(figsize=(9, 4))
     points = [(float(count), workers.workers(count)) for count in workers.WORKERS]
-    _lines(panel, run, points, workers.COST)
+    lines(panel, run, points, workers.COST)
     panel.set(
         title="The master's processor time to start a worker",
         xlabel="workers of the pool",
         xticks=workers.WORKERS,
     )
-    _counts(panel.xaxis)
-    _finish(figure, path)
+    counts(panel.xaxis)
+    finish(figure, path)
 
 
 def _endings(run: Run, path: Path) -> None:
     figure, panel = plt.subplots(figsize=(9, 4))
     _rows(panel, run, [case.name for case in endings.cases(run.about["size"])], endings.TIME)
     panel.set(title="Further left is better", xlabel="time to end")
-    _finish(figure, path)
+    finish(figure, path)
 
 
 def _large_messages(run: Run, path: Path) -> None:
@@ -229,11 +229,11 @@ def _large_messages(run: Run, path: Path) -> None:
             points = [
                 (float(n), large_messages.case_name(label, way)) for label, n in sizes.items()
             ]
-            _lines(panel, run, points, metric)
+            lines(panel, run, points, metric)
             panel.set(title=f"{way}: {metric.label}", xlabel="message")
             panel.set_xticks(list(sizes.values()), list(sizes))
             panel.xaxis.set_minor_formatter(NullFormatter())
-    _finish(figure, path)
+    finish(figure, path)
 
 
 def _agents(run: Run, path: Path) -> None:
@@ -244,10 +244,10 @@ def _agents(run: Run, path: Path) -> None:
         (panels[1], agents.MEMORY, "Memory of the master for a link"),
         (panels[2], agents.DEFAULT, "No-op tasks a second, default chunks"),
     ):
-        _lines(panel, run, points, metric)
+        lines(panel, run, points, metric)
         panel.set(title=title, xlabel="agents", xticks=agents.AGENTS)
-        _counts(panel.xaxis)
-    _finish(figure, path)
+        counts(panel.xaxis)
+    finish(figure, path)
 
 
 DRAW: Mapping[str, Callable[[Run, Path], None]] = {
@@ -269,7 +269,7 @@ DRAW: Mapping[str, Callable[[Run, Path], None]] = {
 }
 
 
-def _lines(panel: Any, run: Run, points: Points, metric: Metric, *, log_x: bool = True) -> None:
+def lines(panel: Any, run: Run, points: Points, metric: Metric, *, log_x: bool = True) -> None:
     """Draw a line for each contender, whose bars reach from the least to the greatest of the
     rounds."""
     for name, contender in BY_NAME.items():
@@ -303,7 +303,7 @@ def _lines(panel: Any, run: Run, points: Points, metric: Metric, *, log_x: bool 
     if log_x:
         panel.set_xscale("log")
     panel.set_yscale("log")
-    _unit(panel.yaxis, metric.unit)
+    unit(panel.yaxis, metric.unit)
     panel.grid(axis="y", color="#eeeeee")
 
 
@@ -333,7 +333,7 @@ def _rows(panel: Any, run: Run, cases: Sequence[str], metric: Metric) -> None:
         yticks=range(len(cases)), yticklabels=cases, xscale="log", ylim=(len(cases) - 0.5, -0.5)
     )
     panel.grid(axis="y", color="#eeeeee")
-    _unit(panel.xaxis, metric.unit)
+    unit(panel.xaxis, metric.unit)
 
 
 def _found(run: Run, case: str, contender: str, metric: Metric) -> Summary | None:
@@ -347,18 +347,20 @@ def _bars(found: Sequence[Summary]) -> list[list[float]]:
     ]
 
 
-def _unit(axis: Any, unit: str, ticks: Sequence[float] | None = None) -> None:
+def unit(axis: Any, name: str, ticks: Sequence[float] | None = None) -> None:
+    """Label an axis with numbers of this unit, at these ticks if they are given."""
     low, high = axis.get_view_interval()
     if ticks:
         axis.set_ticks(ticks)
     elif high < _NARROW * low:
         # Ticks at decades alone would leave one number or none on an axis of a decade or two.
         axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: _short(value, unit)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: _short(value, name)))
     axis.set_minor_formatter(NullFormatter())
 
 
-def _counts(axis: Any) -> None:
+def counts(axis: Any) -> None:
+    """Label an axis with whole numbers."""
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
     axis.set_minor_formatter(NullFormatter())
 
@@ -370,7 +372,8 @@ def _short(value: float, unit: str) -> str:
     return short if unit == "1/s" else f"{short} {name}"
 
 
-def _finish(figure: Any, path: Path, *, legend: bool = True) -> None:
+def finish(figure: Any, path: Path, *, legend: bool = True) -> None:
+    """Add one legend for all panels, and write the picture."""
     for panel in figure.axes:
         panel.spines[["top", "right"]].set_visible(False)
     if legend:

@@ -51,13 +51,18 @@ def about(
         "rounds": rounds,
         "size": size,
         "cores": len(os.sched_getaffinity(0)),
-        "processor": _field("/proc/cpuinfo", "model name"),
+        "processor": processor(),
         "memory": in_words(int(_field("/proc/meminfo", "MemTotal").split()[0]) * 1024, "B"),
         "load": round(os.getloadavg()[0], 2),
         "system": f"{platform.system()} {'.'.join(platform.release().split('.')[:2])}",
         "python": platform.python_version(),
         "versions": {name: version for name in (*names, *_ALWAYS) if (version := _version(name))},
     }
+
+
+def processor() -> str:
+    """Return the name of the machine's processors."""
+    return _field("/proc/cpuinfo", "model name")
 
 
 def _version(module: str) -> str:

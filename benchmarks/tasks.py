@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Callable
 from typing import Any
 
 
@@ -68,3 +69,6 @@ def after(seconds: float, item: Any) -> Any:
 
 
 sleep = time.sleep
+
+pretend: Callable[[float], None] = time.sleep
+"""Take as long as the work that a task stands for. A fake child is busy for so long instead."""

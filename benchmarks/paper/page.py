@@ -1,0 +1,196 @@
+"""Generated parts of docs/paper.md: tables between markers, made from the results alone."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from benchmarks import overhead, report
+from benchmarks.contenders import BY_NAME
+from benchmarks.model import Case, Metric, Run
+from benchmarks.paper import breakout, evolution, walker
+from benchmarks.paper.parts import PARTS
+from benchmarks.samples import Summary, in_words, ratio, summary, times
+from benchmarks.session import ROOT
+
+FOLDER = ROOT / "docs" / "paper"
+PAGE = ROOT / "docs" / "paper.md"
+RESULTS = "results.json"
+_MARKED = re.compile(r"(<!-- (\w+): begin[^>]*-->\n)(.*?)(<!-- \2: end -->)", re.DOTALL)
+
+
+def load(folder: Path) -> dict[str, Run]:
+    """Return the runs of earlier calls, by part, so that one part can be measured alone."""
+    return report.load(folder, RESULTS)
+
+
+def write(folder: Path, runs: Mapping[str, Run]) -> Path:
+    """Fill the page from the results of its folder; beside other results, write tables.md."""
+    texts = generated(folder, runs)
+    if folder == FOLDER:
+        PAGE.write_text(filled(PAGE.read_text(encoding="utf-8"), texts), encoding="utf-8")
+        return PAGE
+    path = folder / "tables.md"
+    path.write_text("\n\n".join(texts.values()) + "\n", encoding="utf-8")
+    return path
+
+
+def generated(folder: Path, runs: Mapping[str, Run]) -> dict[str, str]:
+    """Return the generated text of each part that has results."""
+    texts = {name: _TEXTS[name](runs[name]) for name in PARTS if name in runs}
+    if (folder / walker.RESULTS).exists():
+        texts["walker"] = _walker(walker.load(folder))
+    return texts
+
+
+def filled(page: str, texts: Mapping[str, str]) -> str:
+    """Return the page with these texts between their markers; other text stays."""
+
+    def fill(found: re.Match[str]) -> str:
+        begin, name, old, end = found.groups()
+        return f"{begin}\n{texts[name]}\n\n{end}" if name in texts else begin + old + end
+
+    return _MARKED.sub(fill, page)
+
+
+def _overhead(run: Run) -> str:
+    cases = PARTS["overhead"].cases(run.about["size"])
+    names = _present(run, cases)
+    head = ["framework", *(_short(case) for case in cases), "1 ms, times Fiber"]
+    rows = []
+    for name in names:
+        cells = [_cell(run, case, name, overhead.TIME) for case in cases]
+        rows.append([BY_NAME[name].label, *cells, _times(run, cases[-1], name, "fiber")])
+    return _text(run, report.table(head, rows))
+
+
+def _short(case: Case) -> str:
+    return overhead.DURATIONS[case.params["duration"]]
+
+
+def _evolution(run: Run) -> str:
+    cases = evolution.cases(run.about["size"])
+    names = _present(run, cases)
+    head = ["workers", "bound", *(BY_NAME[name].label for name in names)]
+    rows = [
+        [
+            f"{case.params['workers']:,}",
+            in_words(evolution.bound(**case.params), "s"),
+            *(_with_efficiency(run, case, name) for name in names),
+        ]
+        for case in cases
+    ]
+    note = (
+        f"{cases[0].params['iterations']} iterations of {cases[0].params['population']:,} "
+        "episodes. In parentheses: the bound divided by the time (1 is the best possible)."
+    )
+    return _text(run, report.table(head, rows), note)
+
+
+def _with_efficiency(run: Run, case: Case, name: str) -> str:
+    cell = _cell(run, case, name, evolution.TIME)
+    found = _found(run, case, name, evolution.TIME)
+    if not found:
+        return cell
+    return f"{cell} ({evolution.bound(**case.params) / found.median:.2f})"
+
+
+def _breakout(run: Run) -> str:
+    cases = breakout.cases(run.about["size"])
+    names = _present(run, cases)
+    head = ["case", *(BY_NAME[name].label for name in names)]
+    rows = []
+    for case in cases:
+        cells = []
+        for name in names:
+            cell = _cell(run, case, name, breakout.TIME)
+            versus = _times(run, case, name, breakout.BASELINE)
+            cells.append(f"{cell} ({versus})" if versus and name != breakout.BASELINE else cell)
+        rows.append([case.name, *cells])
+    note = (
+        "Time of all steps with learning. In parentheses: the ratio to SubprocVecEnv with "
+        "multiprocessing in the same round."
+    )
+    return _text(run, report.table(head, rows), note)
+
+
+def _present(run: Run, cases: Sequence[Case]) -> list[str]:
+    """Return the contenders that have a value or a failure in one of the cases."""
+    return [
+        name
+        for name in BY_NAME
+        if any(
+            name in run.failures.get(case.name, {}) or name in run.values.get(case.name, {})
+            for case in cases
+        )
+    ]
+
+
+def _cell(run: Run, case: Case, name: str, metric: Metric) -> str:
+    if name in run.failures.get(case.name, {}):
+        return "✗"
+    found = _found(run, case, name, metric)
+    return in_words(found.median, metric.unit) if found else "not run"
+
+
+def _found(run: Run, case: Case, name: str, metric: Metric) -> Summary | None:
+    return summary(run.values.get(case.name, {}).get(name, {}).get(metric.name, []))
+
+
+def _times(run: Run, case: Case, name: str, other: str) -> str:
+    metric = case.metrics[0].name
+    values = run.values.get(case.name, {})
+    found = ratio(values.get(name, {}).get(metric, []), values.get(other, {}).get(metric, []))
+    return times(found.median) if found else ""
+
+
+def _text(run: Run, table: str, note: str = "") -> str:
+    shares = ", ".join(f"{100 * share:.0f} %" for share in run.in_use)
+    sentences = [
+        f"Median of at most {run.about['rounds']} rounds.",
+        note,
+        f"Before the rounds, other programs used {shares} of the processors' time."
+        if shares
+        else "",
+        f"The load was {run.about['load']:g} at the beginning and {run.about['load after']:g} at "
+        "the end.",
+    ]
+    how = " ".join(each for each in sentences if each)
+    parts = [table, how, _failures(run), report.origin(run.about)]
+    return "\n\n".join(part for part in parts if part)
+
+
+def _failures(run: Run) -> str:
+    lines = [
+        f"* ✗ {BY_NAME[name].label}, {case}: {why}"
+        for case, failed in run.failures.items()
+        for name, why in failed.items()
+    ]
+    lines += [
+        f"* not installed: {BY_NAME[name].label} ({what})"
+        for name, what in run.about["skipped"].items()
+    ]
+    return "\n".join(lines)
+
+
+def _walker(found: walker.Results) -> str:
+    first, last = found.tests[0], max(found.tests, key=lambda test: test.mean)
+    rows = [
+        ("environment", walker.ENVIRONMENT),
+        ("generations of 48 episodes", f"{found.generations:,}"),
+        ("steps", f"{found.steps:,}"),
+        ("time", f"{found.minutes:.1f} minutes, {found.workers} workers"),
+        ("return before training", f"{first.mean:.0f}"),
+        ("best return", f"{last.mean:.0f}, in generation {last.generation}"),
+        ("load before and after", f"{found.load_before:g} and {found.load_after:g}"),
+        ("command", f"`{found.command}`"),
+    ]
+    return report.table(("", ""), rows)
+
+
+_TEXTS: Mapping[str, Callable[[Run], str]] = {
+    "overhead": _overhead,
+    "evolution": _evolution,
+    "breakout": _breakout,
+}

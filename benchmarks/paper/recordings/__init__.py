@@ -1,0 +1,1 @@
+"""Times that real episodes and real steps took, made by `python -m benchmarks.paper.record`."""
