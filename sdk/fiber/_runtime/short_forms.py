@@ -30,7 +30,13 @@ _BITS = 256
 
 _MORE = "..."
 
-_BRACKETS = {list: "[]", tuple: "()", set: "{}", frozenset: "{}", dict: "{}"}
+_BRACKETS: dict[type, tuple[str, str]] = {
+    list: ("[", "]"),
+    tuple: ("(", ")"),
+    set: ("{", "}"),
+    frozenset: ("{", "}"),
+    dict: ("{", "}"),
+}
 
 _name_of = type.__dict__["__name__"].__get__
 """Return the name of a class.  A metaclass cannot replace it."""
@@ -86,10 +92,9 @@ class _Writer:
 
     def _container(self, value: Any, kind: type) -> str:
         left, right = _BRACKETS[kind]
+        forms: Iterator[str] = map(self.form, value)
         if kind is dict:
             forms = (f"{self.form(key)}: {self.form(each)}" for key, each in value.items())
-        else:
-            forms = map(self.form, value)
         inside = self._joined(forms)
         comma = "," if kind is tuple and len(value) == 1 else ""
         return f"{left}{inside}{comma}{right}"
