@@ -56,8 +56,7 @@ def phase_2(way: Way, options: argparse.Namespace) -> tuple[Policy, list[list[fl
     tasks = [(way, options.episodes, options.seed + number) for number in range(options.policies)]
     with fiber.Pool(options.policies) as pool:
         policies, curves = zip(*pool.starmap(robustify, tasks, chunksize=1), strict=True)
-    best = max(range(options.policies), key=lambda number: curves[number][-1])
-    return policies[best], list(curves)
+    return max(zip(policies, curves, strict=True), key=lambda each: each[1][-1])[0], list(curves)
 
 
 def draw(path: Path, found_in: dict[Any, int], curves: list[list[float]]) -> None:
@@ -87,10 +86,8 @@ def main() -> None:
         sys.exit("The treasure was not found. More --rounds, or another --seed, may find it.")
     policy, curves = phase_2(way, options)
     successes = sum(play(policy, random.Random(seed)) for seed in range(200))
-    print(
-        f"with sticky moves, {successes / 2:.0f}% of 200 episodes succeed; picture: {options.out}"
-    )
     draw(options.out, found_in, curves)
+    print(f"with sticky moves, {successes / 2:.0f}% of 200 episodes succeed: {options.out}")
 
 
 if __name__ == "__main__":

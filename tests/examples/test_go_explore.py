@@ -19,7 +19,7 @@ def test_both_phases_succeed_and_are_the_same_on_each_backend(tmp_path: Path) ->
         outputs.append(done.stdout)
     here, there = outputs
     assert here == there
-    (successes,) = re.findall(r"^with sticky moves, (\d+)% of 200 episodes succeed", here, re.M)
+    (successes,) = re.findall(r"^with sticky moves, (\d+)% of 200 episodes succeed: ", here, re.M)
     assert int(successes) > 20
 
 
