@@ -10,16 +10,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fiber._agent.interface import Cause
-from fiber._wire.messages import (
+from fiber._wire.blob_messages import (
     DIGEST_BYTES,
-    PROTOCOL,
+    Fetch,
+    Forget,
+    Holding,
+    KeepBlob,
+    Lacking,
+    Serve,
+    Unfetched,
+    Want,
+)
+from fiber._wire.messages import (
     ChildOutput,
     Deliver,
     Exited,
-    Forget,
     FromChild,
-    KeepBlob,
-    Lacking,
     Leave,
     LinkMessage,
     Measure,
@@ -37,6 +43,7 @@ from fiber._wire.messages import (
     decode,
     lane,
 )
+from fiber._wire.packet_layout import PROTOCOL
 
 SECRET = "the user's own"
 
@@ -54,6 +61,11 @@ messages: st.SearchStrategy[LinkMessage] = st.one_of(
     st.builds(Forget, digests),
     st.builds(Leave, st.floats(allow_nan=False), any_text),
     st.builds(Lacking, digests),
+    st.builds(Serve, digests, ids),
+    st.builds(Fetch, digests, ids, ids, any_text, any_text, any_text, any_text, ids),
+    st.builds(Holding, digests, any_text, any_text, any_text),
+    st.builds(Unfetched, digests, ids, any_text),
+    st.builds(Want, digests),
     st.builds(Started, ids, numbers),
     st.builds(Signal, ids, numbers),
     st.builds(Deliver, ids, ids, data, buffers),
@@ -102,7 +114,7 @@ def test_a_damaged_frame_raises_only_protocol_error(
         pass
 
 
-@given(st.integers(0, 20), data)
+@given(st.integers(0, 30), data)
 def test_noise_of_any_kind_raises_only_protocol_error(kind: int, noise: bytes) -> None:
     try:
         decode(bytes([PROTOCOL, kind]) + noise)
@@ -184,6 +196,16 @@ def test_buffers_of_any_item_size_are_taken_by_their_bytes() -> None:
         (
             KeepBlob(bytes(DIGEST_BYTES), SECRET.encode()),
             "KeepBlob(digest=<32 bytes>, data=<14 bytes>)",
+        ),
+        (
+            Fetch(bytes(DIGEST_BYTES), 1, 2, "host:1", "word", SECRET, "hash", 3),
+            "Fetch(digest=<32 bytes>, number=1, size=2, address=<6 characters>, "
+            "uid=<4 characters>, key=<14 characters>, certificate=<4 characters>, port=3)",
+        ),
+        (
+            Holding(bytes(DIGEST_BYTES), "host:1", SECRET, "hash"),
+            "Holding(digest=<32 bytes>, address=<6 characters>, key=<14 characters>, "
+            "certificate=<4 characters>)",
         ),
         (
             Deliver(3, 4, SECRET.encode(), [SECRET.encode()]),

@@ -1,8 +1,7 @@
 """Agents behind links and their children, as the master sees them.
 
 ``RemoteAgent`` is an agent that has connected. ``RemoteChild`` is a child on its host, and
-``RemoteTaskChannel`` the child's task channel. ``BlobSender`` sends the blobs that the agent's
-children need.
+``RemoteTaskChannel`` the child's task channel.
 """
 
 from __future__ import annotations
@@ -11,14 +10,14 @@ import itertools
 import pickle
 import signal
 import threading
-import weakref
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import lru_cache, partial
+from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache
 from typing import Protocol
 
 from fiber._agent.interface import OUT_OF_MEMORY, Cause, ChildObserver, ChildSpec, ExitReport
 from fiber._agent.usage import Usage
+from fiber._backends.blobs import BlobSender, Fanout
 from fiber._hub.hub import Hub
 from fiber._logs import OutputWriter
 from fiber._output_files import OutputFile
@@ -26,6 +25,7 @@ from fiber._transport.link import Link
 from fiber._transport.link_protocol import Frame
 from fiber._transport.loop import EventLoop
 from fiber._wire import messages, packet
+from fiber._wire.blob_messages import Holding, Lacking, Unfetched
 from fiber._wire.memory_files import Blob, BytesLike
 from fiber._wire.packet import Message
 
@@ -80,6 +80,7 @@ class RemoteAgent:
         hub: Hub,
         output: OutputWriter,
         observer: AgentObserver,
+        fanout: Fanout | None = None,
     ) -> None:
         self.host = host
         self.loop = loop
@@ -96,7 +97,7 @@ class RemoteAgent:
         self.suspect = False
         """True while the agent is silent for longer than usual."""
         self._link = link
-        self._blobs = BlobSender(loop, self._put)
+        self._blobs = BlobSender(loop, self._put, fanout)
         self._hub = hub
         self._output = output
         self._observer = observer
@@ -148,6 +149,7 @@ class RemoteAgent:
         if self.leaving or self.lost is not None:
             return
         self.leaving = reason
+        self._blobs.retire()
         self._observer.leaving(self)
         for child in list(self._children.values()):
             child.observer.draining()
@@ -159,6 +161,7 @@ class RemoteAgent:
         self.lost = reason
         self.disrupted = bool(disrupted or self.disrupted or self.leaving)
         self._hub.unlink(self.host, reason)
+        self._blobs.close()
         try:
             self._observer.lost(self, reason)
         finally:  # also after an error, so that no caller waits for these children
@@ -197,8 +200,8 @@ class RemoteAgent:
         if isinstance(message, messages.Leave):
             self.leave(message.reason)
             return
-        if isinstance(message, messages.Lacking):
-            self._blobs.lost(message.digest)
+        if isinstance(message, Lacking | Holding | Unfetched):
+            self._blobs.on_report(message)
             return
         number = getattr(message, "child", None)
         child = None if number is None else self._children.get(number)
@@ -415,78 +418,6 @@ class RemoteChild:
         if self._agent is not None:
             report = self._agent.explain(report)
         self.observer.exited(report)
-
-
-class Send(Protocol):
-    """Function that sends a message, and calls ``on_left`` once the whole message has left."""
-
-    def __call__(
-        self, message: messages.LinkMessage, on_left: Callable[[], None] | None = None
-    ) -> None: ...
-
-
-class BlobSender:
-    """Sender of blobs.  It sends each blob once, and Forget when no object refers to the blob.
-
-    So an agent keeps no more blobs than this program does.  A blob lives as long as a pool, a child
-    or the program refers to it.  Runs on the loop thread.
-    """
-
-    def __init__(self, loop: EventLoop, send: Send) -> None:
-        self._loop = loop
-        self._send = send
-        self._sent: dict[bytes, weakref.ref[Blob]] = {}
-        self._leaving: dict[bytes, int] = {}
-        """Number of times that each blob was sent and has not left."""
-        self._waiting: list[tuple[list[bytes], Callable[[], None]]] = []
-        """Blobs that a caller needs, and the function to call when they have left."""
-
-    def send_missing(self, blobs: Iterable[Blob], then: Callable[[], None]) -> None:
-        """Send the blobs that the agent does not have, and call ``then`` when all have left.
-
-        Without this wait a small message could overtake a large blob.
-        """
-        needed = []
-        for blob in blobs:
-            digest = blob.digest
-            needed.append(digest)
-            if digest not in self._sent:
-                self._leaving[digest] = self._leaving.get(digest, 0) + 1
-                self._send(messages.KeepBlob(digest, blob.data), partial(self._left, digest))
-            # The newest of several with the same content counts.
-            self._sent[digest] = weakref.ref(blob, self._forgetter(digest))
-        self._waiting.append((needed, then))
-        self._go_on()
-
-    def lost(self, digest: bytes) -> None:
-        """Note that the agent could not keep a blob."""
-        self._sent.pop(digest, None)
-
-    def _left(self, digest: bytes) -> None:
-        self._leaving[digest] -= 1
-        if not self._leaving[digest]:
-            del self._leaving[digest]
-            self._go_on()
-
-    def _go_on(self) -> None:
-        waiting, self._waiting = self._waiting, []
-        for needed, then in waiting:
-            if self._leaving.keys().isdisjoint(needed):
-                then()
-            else:
-                self._waiting.append((needed, then))
-
-    def _forgetter(self, digest: bytes) -> Callable[[object], None]:
-        # A finalizer runs on any thread, and may only put a call into the loop's queue.
-        return lambda _: self._loop.call_soon(self._forget, digest)
-
-    def _forget(self, digest: bytes) -> None:
-        reference = self._sent.get(digest)
-        if (
-            reference is not None and reference() is None
-        ):  # else the same blob was made and sent again
-            del self._sent[digest]
-            self._send(messages.Forget(digest))
 
 
 class RemoteTaskChannel:

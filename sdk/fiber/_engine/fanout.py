@@ -136,7 +136,8 @@ class Spread(Generic[_Agent]):
 
     def _put_first(self, receivers: Iterable[_Agent]) -> list[Transfer[_Agent]]:
         """Let receivers whose source failed go first; the master serves those that tried enough."""
-        orders, first = [], {}
+        orders: list[Transfer[_Agent]] = []
+        first: dict[_Agent, None] = {}
         for receiver in receivers:
             if self._tried(receiver) >= TRIES:
                 orders.append(self._begin(receiver, None))

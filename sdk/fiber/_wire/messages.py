@@ -14,16 +14,11 @@ import struct
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
+from fiber._wire import blob_messages
+from fiber._wire.blob_messages import BlobMessage, KeepBlob
 from fiber._wire.memory_files import BytesLike
-from fiber._wire.packet_layout import pieces_of, read_packet, redacted
+from fiber._wire.packet_layout import PROTOCOL, pieces_of, read_packet, redacted
 from fiber.errors import FiberError
-
-PROTOCOL = 5
-"""Version of the frames of this module and of all that they carry: the messages of ``work.py`` and
-``hub.protocol``, and pickles of Fiber's classes.  Raise it when one of these changes."""
-
-DIGEST_BYTES = 32
-"""Length of a blob's name, the SHA-256 of its bytes."""
 
 
 class ProtocolError(FiberError):
@@ -48,44 +43,6 @@ class Start(NamedTuple):
 
     def __repr__(self) -> str:
         return redacted(self)
-
-
-class KeepBlob(NamedTuple):
-    """Master to agent: keep this blob; Start frames name it by its digest until a Forget."""
-
-    digest: bytes
-    data: BytesLike
-
-    def encode(self) -> bytes:
-        """Return the frame."""
-        return b"".join(self.pieces())
-
-    def pieces(self) -> Sequence[BytesLike]:
-        """Return the frame in pieces.  The data is not copied."""
-        return _BLOB_HEAD.pack(PROTOCOL, _BLOB, self.digest), self.data
-
-    def __repr__(self) -> str:
-        return redacted(self)
-
-
-class Forget(NamedTuple):
-    """Master to agent: no later Start names this blob, unless it is sent again."""
-
-    digest: bytes
-
-    def encode(self) -> bytes:
-        """Return the frame."""
-        return _BLOB_HEAD.pack(PROTOCOL, _FORGET, self.digest)
-
-
-class Lacking(NamedTuple):
-    """Agent to master: this blob is missing here; send it again before a child needs it."""
-
-    digest: bytes
-
-    def encode(self) -> bytes:
-        """Return the frame."""
-        return _BLOB_HEAD.pack(PROTOCOL, _LACKING, self.digest)
 
 
 class Started(NamedTuple):
@@ -331,10 +288,8 @@ class Leave(NamedTuple):
 
 
 LinkMessage: TypeAlias = (
-    Start
-    | KeepBlob
-    | Forget
-    | Lacking
+    BlobMessage
+    | Start
     | Started
     | Signal
     | Deliver
@@ -389,7 +344,7 @@ def decode(frame: BytesLike) -> LinkMessage:
 
 _START, _STARTED, _SIGNAL, _DELIVER, _FROM_CHILD, _RECALL, _RECALLED, _EXITED = range(1, 9)
 _OUTPUT, _TUNNEL_OPEN, _TUNNEL_DATA, _TUNNEL_CLOSE, _SHUTDOWN = 9, 11, 12, 13, 14
-_BLOB, _FORGET, _LACKING, _MEMORY, _LEAVE, _STACK, _MEASURE, _MEASURED = range(15, 23)
+_MEMORY, _LEAVE, _STACK, _MEASURE, _MEASURED = range(18, 23)
 
 _HEAD = struct.Struct("<BB")
 _NUMBER = struct.Struct("<BBQ")
@@ -397,7 +352,6 @@ _NUMBERS = struct.Struct("<BBQq")
 _DELIVERY = struct.Struct("<BBQQ")
 _USAGE = struct.Struct("<BBQQQ")
 _GRACE = struct.Struct("<BBd")
-_BLOB_HEAD = struct.Struct(f"<BB{DIGEST_BYTES}s")
 
 
 def pieces(message: LinkMessage) -> Sequence[BytesLike]:
@@ -417,8 +371,8 @@ def lane(message: LinkMessage) -> Hashable:
         return (_TUNNEL_DATA, message.tunnel)
     if isinstance(message, Start | Deliver | FromChild | Recall | Recalled | Exited | ChildOutput):
         return (_DELIVER, message.child)
-    if isinstance(message, KeepBlob | Forget):
-        return (_BLOB, message.digest)
+    if isinstance(message, BlobMessage):
+        return (blob_messages.KEEP, message.digest)
     return None
 
 
@@ -445,18 +399,6 @@ def _json(value: Any) -> bytes:
 def _read_start(view: memoryview) -> Start:
     spec, (process,) = read_packet(view, _NUMBER.size)
     return Start(_NUMBER.unpack_from(view)[2], spec, process)
-
-
-def _read_blob(view: memoryview) -> KeepBlob:
-    return KeepBlob(_BLOB_HEAD.unpack_from(view)[2], view[_BLOB_HEAD.size :])
-
-
-def _read_forget(view: memoryview) -> Forget:
-    return Forget(_BLOB_HEAD.unpack(view)[2])
-
-
-def _read_lacking(view: memoryview) -> Lacking:
-    return Lacking(_BLOB_HEAD.unpack(view)[2])
 
 
 def _read_started(view: memoryview) -> Started:
@@ -566,10 +508,8 @@ def _string(value: Any) -> str:
 
 
 _READERS: dict[int, Callable[[memoryview], LinkMessage]] = {
+    **blob_messages.READERS,
     _START: _read_start,
-    _BLOB: _read_blob,
-    _FORGET: _read_forget,
-    _LACKING: _read_lacking,
     _STARTED: _read_started,
     _SIGNAL: _read_signal,
     _DELIVER: _read_deliver,

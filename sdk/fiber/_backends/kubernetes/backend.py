@@ -18,6 +18,7 @@ from typing import Any
 from fiber import _worker_images
 from fiber._agent.interface import ChildObserver, ChildSpec
 from fiber._backends.agent_set import AgentSet
+from fiber._backends.blobs import Fanout
 from fiber._backends.kubernetes.api import Api
 from fiber._backends.kubernetes.attached_pool import LOST, AttachedPool
 from fiber._backends.kubernetes.fiber_pool import FiberPoolClient
@@ -152,7 +153,13 @@ class Pods:
             self._placement, maximum=config.max_pods, idle_timeout=config.idle_timeout
         )
         self.agents = AgentSet(
-            loop, hub, output, self._placement, on_change=self._changed, on_lost=self._lost
+            loop,
+            hub,
+            output,
+            self._placement,
+            fanout=None if config.pass_on == "never" else Fanout(names.PEER_PORT),
+            on_change=self._changed,
+            on_lost=self._lost,
         )
         self._waiting = WaitingChildren(
             self.agents,

@@ -1,0 +1,347 @@
+"""Large blobs that agents pass on to each other, and agents that die or lie on the way."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import pickle
+import signal
+import socket
+import ssl
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import fiber
+from faults.program import wait_for
+from faults.proxy import Proxy
+from faults.runtime import running
+from faults.test_strangers import GARBAGE, Bomb
+from fiber._agent.blobs import BlobFetch, BlobSource, BlobStore
+from fiber._backends.blobs import BlobSender, Fanout
+from fiber._backends.loopback import LoopbackBackend
+from fiber._engine.fanout import COPIES
+from fiber._transport.listener import MasterListener
+from fiber._transport.loop import Loop
+from fiber._wire import messages
+from fiber._wire.blob_messages import RECEIVER, Fetch, Holding, KeepBlob, Want
+from fiber_api import identity
+from patience import PATIENCE
+
+LARGE = 3 << 20
+AGENTS = 7
+
+_kept: tuple[Any, ...] = ()
+
+
+def keep(*values: Any) -> None:
+    global _kept
+    _kept = values
+
+
+def hash_of_kept(_: object = None) -> str:
+    return hashlib.sha256(_kept[0]).hexdigest()
+
+
+# Whole programs
+
+
+@contextmanager
+def program(pass_on: str = "always") -> Iterator[LoopbackBackend]:
+    with running(backend="loopback", agents=AGENTS, pass_on=pass_on) as runtime:
+        backend = runtime.backend
+        assert isinstance(backend, LoopbackBackend)
+        backend._output.write("test", "begins")  # its thread is not the pool's
+        wait_for(lambda: len(backend.agents.agents) == AGENTS)
+        yield backend
+
+
+def bytes_to_agents(backend: LoopbackBackend) -> int:
+    agents = backend.agents.agents.values()
+    return sum(agent._link.statistics().bytes_sent for agent in agents)
+
+
+def run_pool() -> None:
+    data = os.urandom(LARGE)
+    expected = hashlib.sha256(data).hexdigest()
+    with fiber.Pool(AGENTS, keep, (data,)) as pool:
+        assert pool.broadcast(hash_of_kept) == [expected] * AGENTS
+
+
+def test_the_master_sends_a_few_copies_and_agents_the_others() -> None:
+    with program() as backend:
+        run_pool()
+        assert LARGE <= bytes_to_agents(backend) < (COPIES + 1) * LARGE
+
+
+@pytest.mark.parametrize("pass_on", ["auto", "never"])
+def test_on_one_machine_the_master_sends_all_copies(pass_on: str) -> None:
+    with program(pass_on) as backend:
+        run_pool()
+        assert bytes_to_agents(backend) >= AGENTS * LARGE
+
+
+@pytest.mark.parametrize("signum", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "stopped"])
+def test_a_source_that_fails_in_the_middle_is_gone_round(
+    monkeypatch: pytest.MonkeyPatch, signum: signal.Signals
+) -> None:
+    victims: list[int] = []
+    carry_out = Fanout._carry_out
+
+    def fail_first(fanout: Fanout, digest: bytes, spreading: Any, orders: Any) -> None:
+        sources = [order.source for order in orders if order.source is not None]
+        if sources and not victims:
+            (host,) = (a.host for a in backend.agents.agents.values() if a._blobs is sources[0])
+            pid = backend._by_name[host].process.pid
+            assert pid is not None
+            victims.append(pid)
+            os.kill(pid, signum)
+        carry_out(fanout, digest, spreading, orders)
+
+    monkeypatch.setattr(Fanout, "_carry_out", fail_first)
+    data = os.urandom(LARGE)
+    expected = hashlib.sha256(data).hexdigest()
+    with program() as backend, fiber.Pool(AGENTS, keep, (data,)) as pool:
+        answers = pool.imap_unordered(hash_of_kept, range(20 * AGENTS))
+        assert set(answers) == {expected}
+        assert victims
+
+
+def test_where_agents_do_not_reach_each_other_the_master_sends_all_copies(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    holding = Fanout.holding
+    with socket.create_server(("127.0.0.1", 0)) as closed:
+        nowhere = "127.0.0.1:{}".format(closed.getsockname()[1])
+
+    def unreachable(fanout: Fanout, agent: BlobSender, message: Holding) -> None:
+        holding(fanout, agent, message._replace(address=nowhere))
+
+    monkeypatch.setattr(Fanout, "holding", unreachable)
+    with program() as backend:
+        run_pool()
+        assert bytes_to_agents(backend) >= AGENTS * LARGE
+
+
+@pytest.mark.parametrize("field", ["address", "key", "certificate"])
+def test_an_agent_that_gives_a_useless_address_or_key_serves_nobody(
+    monkeypatch: pytest.MonkeyPatch, field: str
+) -> None:
+    holding = Fanout.holding
+
+    def nonsense(fanout: Fanout, agent: BlobSender, message: Holding) -> None:
+        holding(fanout, agent, message._replace(**{field: "nonsense"}))
+
+    monkeypatch.setattr(Fanout, "holding", nonsense)
+    with program() as backend:
+        run_pool()
+        assert len(backend.agents.agents) == AGENTS, "no link ended"
+
+
+# One source and one receiver
+
+DATA = os.urandom(LARGE)
+DIGEST = hashlib.sha256(DATA).digest()
+
+
+@dataclass
+class Result:
+    """What came of a transfer."""
+
+    done: threading.Event = field(default_factory=threading.Event)
+    data: bytes = b""
+    reason: str = ""
+
+    def on_blob(self, message: KeepBlob) -> None:
+        self.data = bytes(message.data)
+        self.done.set()
+
+    def on_failed(self, reason: str) -> None:
+        self.reason = reason
+        self.done.set()
+
+
+@pytest.fixture
+def loop() -> Iterator[Loop]:
+    made = Loop()
+    made.start_thread("test-loop")
+    yield made
+    made.stop()
+
+
+def on_loop(loop: Loop, call: Callable[[], Any]) -> Any:
+    """Call a function on the loop thread and return its result."""
+    done, results = threading.Event(), list[Any]()
+
+    def run() -> None:
+        results.append(call())
+        done.set()
+
+    loop.call_soon(run)
+    assert done.wait(PATIENCE)
+    return results[0]
+
+
+@pytest.fixture
+def source(loop: Loop, tmp_path: Path) -> Iterator[BlobSource]:
+    store = BlobStore(str(tmp_path))
+    store.put(KeepBlob(DIGEST, DATA))
+    made = on_loop(loop, lambda: BlobSource(loop, store, "127.0.0.1:0"))
+    yield made
+    closed = threading.Event()
+    made._listener.close(linger=0.0, then=closed.set)
+    assert closed.wait(PATIENCE)
+
+
+def fetch(loop: Loop, source: Any, address: str = "", **changes: Any) -> Result:
+    """Fetch DATA; ``changes`` are fields of the order."""
+    result, credentials = Result(), source.credentials
+    key = identity.agent_key(credentials.pool_key, RECEIVER, "uid")
+    order = Fetch(
+        DIGEST, 1, LARGE, address or source.address, "uid", key, credentials.fingerprint, 0
+    )._replace(**changes)
+    made = on_loop(
+        loop,
+        lambda: BlobFetch(loop, order, on_blob=result.on_blob, on_failed=result.on_failed),
+    )
+    assert result.done.wait(PATIENCE)
+    loop.call_soon(made.close)
+    return result
+
+
+def test_a_receiver_gets_the_blob_that_its_master_named(loop: Loop, source: BlobSource) -> None:
+    assert fetch(loop, source).data == DATA
+
+
+def test_a_blob_that_the_source_does_not_have_is_a_failure(loop: Loop, source: BlobSource) -> None:
+    result = fetch(loop, source, digest=hashlib.sha256(b"other").digest())
+    assert result.reason == "this agent does not have the blob"
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"key": "ab" * 32}, {"uid": "another"}, {"certificate": "ab" * 32}],
+    ids=["wrong key", "another order's key", "another source"],
+)
+def test_a_receiver_and_a_source_that_the_master_did_not_pair_refuse(
+    loop: Loop, source: BlobSource, changes: dict[str, str]
+) -> None:
+    result = fetch(loop, source, **changes)
+    assert not result.data
+    assert "do not trust each other" in result.reason
+    assert fetch(loop, source).data == DATA
+
+
+@pytest.mark.parametrize("silent", [False, True], ids=["dies", "falls silent"])
+def test_a_source_that_fails_in_the_middle_of_a_transfer_is_a_failure(
+    loop: Loop, source: BlobSource, silent: bool
+) -> None:
+    with Proxy(source.address) as proxy:
+        if silent:
+            proxy.silent_after = LARGE // 2
+        else:
+            proxy.break_after = LARGE // 2
+            proxy.lead_to("127.0.0.1:1")  # for new connections, once the first is there
+            proxy.lead_to(source.address)
+        result = fetch(loop, source, proxy.address)
+    if silent:
+        assert not result.data
+        assert result.reason
+    else:
+        assert result.data == DATA, "a link survives its connection"
+
+
+class Liar:
+    """Source that answers each request with a message of the test."""
+
+    def __init__(self, loop: Loop, answer: messages.LinkMessage) -> None:
+        from fiber._transport.credentials import make_credentials
+
+        self.credentials = make_credentials()
+        self._answer = answer
+        self._listener = MasterListener(
+            loop, "127.0.0.1:0", self.credentials, on_agent=self._joined, on_refused=str
+        )
+        self.address = self._listener.address
+
+    def _joined(self, link: Any) -> None:
+        self._link = link
+        link.attach(self)
+
+    def on_frame(self, frame: Any) -> None:
+        assert isinstance(messages.decode(frame), Want)
+        self._link.send(*messages.pieces(self._answer))
+
+    def on_suspect(self) -> None: ...
+
+    def on_trusted(self) -> None: ...
+
+    def on_lost(self, reason: str) -> None: ...
+
+    def close(self) -> None:
+        closed = threading.Event()
+        self._listener.close(linger=0.0, then=closed.set)
+        assert closed.wait(PATIENCE)
+
+
+def test_bytes_with_another_digest_are_refused_and_not_unpickled(
+    loop: Loop, tmp_path: Path
+) -> None:
+    trace = tmp_path / "trace"
+    liar = Liar(loop, KeepBlob(DIGEST, pickle.dumps(Bomb(trace))))
+    result = fetch(loop, liar)
+    assert result.reason == "what it sent is not the blob that the master named"
+    assert not trace.exists()
+    liar.close()
+
+
+def test_an_answer_that_is_no_blob_is_refused(loop: Loop) -> None:
+    liar = Liar(loop, messages.Shutdown(0))
+    assert fetch(loop, liar).reason == "it sent a Shutdown instead of a blob"
+    liar.close()
+
+
+def test_a_receiver_that_sends_something_else_is_cut_off(
+    loop: Loop, source: BlobSource, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Want, "encode", lambda self: messages.Shutdown(0).encode())
+    with pytest.raises(AssertionError):
+        raise AssertionError(fetch(loop, source).reason)
+
+
+@pytest.mark.parametrize("garbage", GARBAGE, ids=range(len(GARBAGE)))
+def test_strangers_at_the_port_of_an_agent_get_nothing(
+    loop: Loop, source: BlobSource, garbage: bytes
+) -> None:
+    host, _, port = source.address.rpartition(":")
+    with socket.create_connection((host, int(port)), PATIENCE) as stranger:
+        stranger.sendall(garbage)
+        stranger.shutdown(socket.SHUT_WR)
+        assert DATA[:100] not in stranger.recv(1 << 16)
+    assert fetch(loop, source).data == DATA
+
+
+def test_a_stranger_without_a_proof_gets_no_blob(loop: Loop, source: BlobSource) -> None:
+    host, _, port = source.address.rpartition(":")
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    with (
+        socket.create_connection((host, int(port)), PATIENCE) as bare,
+        context.wrap_socket(bare) as stranger,
+    ):
+        stranger.sendall(bytes(32) + Want(DIGEST).encode())
+        stranger.sendall(bytes(1 << 12))
+        stranger.settimeout(PATIENCE)
+        received = b""
+        try:
+            while more := stranger.recv(1 << 16):
+                received += more
+        except OSError:
+            pass
+        assert len(received) < 1 << 12
+    assert fetch(loop, source).data == DATA
