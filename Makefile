@@ -109,6 +109,7 @@ bench-operator: $(VENV)/.with-dev
 bench-kubernetes: $(VENV)/.with-bench $(VENV)/.with-dev
 	PYTHONPATH=tests $(BIN)/python -m benchmarks.kubernetes_cluster
 	$(BIN)/python -m benchmarks.relay_memory
+	$(BIN)/python -m benchmarks.fanout
 
 ## make conformance   CPython's tests of multiprocessing and executors, joblib's (BACKEND=local, loopback or kubernetes)
 conformance: $(VENV)/.with-dev $(VENV)/.with-testsuite
