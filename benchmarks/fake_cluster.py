@@ -50,6 +50,7 @@ class FakeCluster:
     same_pids = True
     elastic = False
     sends_program = False
+    passes_on = False
 
     def __init__(
         self, runtime: Runtime, hosts: Sequence[Host], agents: int, fanout: Fanout | None = None

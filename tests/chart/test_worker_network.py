@@ -49,7 +49,10 @@ def test_workers_reach_each_other_at_the_port_for_large_blobs(helm: Helm) -> Non
     worker = podspec.pod(make_pool(), "es-1", ADDRESS)
     spec = policy(helm)
     (rule,) = spec["ingress"]
-    for peers, ports in ((rule["from"], rule["ports"]), (spec["egress"][2]["to"], spec["egress"][2]["ports"])):
+    for peers, ports in (
+        (rule["from"], rule["ports"]),
+        (spec["egress"][2]["to"], spec["egress"][2]["ports"]),
+    ):
         (peer,) = peers
         assert chosen(peer, worker)
         assert not chosen(peer, relays_pod())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import pickle
@@ -126,7 +127,8 @@ def test_a_source_that_fails_in_the_middle_is_gone_round(
         answers = pool.imap_unordered(hash_of_kept, range(20 * AGENTS))
         assert set(answers) == {expected}
         assert victims
-    os.kill(victims[0], signal.SIGKILL)
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(victims[0], signal.SIGKILL)
 
 
 def test_where_agents_do_not_reach_each_other_the_master_sends_all_copies(
@@ -150,7 +152,7 @@ def test_an_agent_that_gives_a_useless_address_or_key_serves_nobody(
     holding = Fanout.holding
 
     def nonsense(fanout: Fanout, agent: BlobSender, message: Holding) -> None:
-        holding(fanout, agent, message._replace(**{field: "nonsense"}))
+        holding(fanout, agent, message._replace(**{field: "nonsense"})  # type: ignore[arg-type]  # each field is a text)
 
     monkeypatch.setattr(Fanout, "holding", nonsense)
     agents = set(backend.agents.agents)
@@ -208,6 +210,7 @@ def source(loop: Loop, tmp_path: Path) -> Iterator[BlobSource]:
     store.put(KeepBlob(DIGEST, DATA))
     made = on_loop(loop, lambda: BlobSource(loop, store, "127.0.0.1:0"))
     yield made
+    on_loop(loop, made.close)
     closed = threading.Event()
     made._listener.close(linger=0.0, then=closed.set)
     assert closed.wait(PATIENCE)
@@ -289,7 +292,7 @@ class Liar:
         self.credentials = make_credentials()
         self._answer = answer
         self._listener = MasterListener(
-            loop, "127.0.0.1:0", self.credentials, on_agent=self._joined, on_refused=str
+            loop, "127.0.0.1:0", self.credentials, on_agent=self._joined, on_refused=print
         )
         self.address = self._listener.address
 

@@ -24,6 +24,7 @@ from fiber._wire.blob_messages import (
 from fiber._wire.messages import (
     ChildOutput,
     Deliver,
+    DeliverShared,
     Exited,
     FromChild,
     Leave,
@@ -69,6 +70,14 @@ messages: st.SearchStrategy[LinkMessage] = st.one_of(
     st.builds(Started, ids, numbers),
     st.builds(Signal, ids, numbers),
     st.builds(Deliver, ids, ids, data, buffers),
+    st.builds(
+        DeliverShared,
+        ids,
+        ids,
+        st.lists(st.tuples(st.integers(0, 2**32 - 1), digests), max_size=3).map(tuple),
+        data,
+        buffers,
+    ),
     st.builds(FromChild, ids, data, buffers),
     st.builds(Recall, ids),
     st.builds(Measure, ids),
@@ -210,6 +219,10 @@ def test_buffers_of_any_item_size_are_taken_by_their_bytes() -> None:
         (
             Deliver(3, 4, SECRET.encode(), [SECRET.encode()]),
             "Deliver(child=3, seq=4, payload=<14 bytes>, buffers=<1 items>)",
+        ),
+        (
+            DeliverShared(3, 4, [(0, bytes(DIGEST_BYTES))], SECRET.encode()),
+            "DeliverShared(child=3, seq=4, shared=<1 items>, payload=<14 bytes>, buffers=())",
         ),
         (
             FromChild(3, memoryview(SECRET.encode())),

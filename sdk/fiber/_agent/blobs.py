@@ -210,6 +210,8 @@ class BlobSource:
 
     def close(self) -> None:
         """End all links."""
+        for receiver in list(self._receivers):
+            receiver.close("this agent ends")
         self._listener.close("this agent ends", linger=0.0)
 
     def _joined(self, link: Link) -> str | None:
@@ -232,7 +234,7 @@ class _Receiver:
         self._link = link
         self._on_end = on_end
         self._has_asked = False
-        self._limit: ScheduledCall = loop.call_later(_REACH, self._close, "it asked for nothing")
+        self._limit: ScheduledCall = loop.call_later(_REACH, self.close, "it asked for nothing")
 
     def on_frame(self, frame: Frame) -> None:
         """Send the blob that the receiver wants."""
@@ -242,11 +244,11 @@ class _Receiver:
         self._has_asked = True
         blob = self._store.find(message.digest)
         if blob is None:
-            self._close("this agent does not have the blob")
+            self.close("this agent does not have the blob")
             return
         data = memoryview(contents(blob.fileno()))
         self._limit.cancel()
-        self._limit = self._loop.call_later(_longest(len(data)), self._close, "it took too long")
+        self._limit = self._loop.call_later(_longest(len(data)), self.close, "it took too long")
         self._link.send(*KeepBlob(message.digest, data).pieces())
 
     def on_suspect(self) -> None:
@@ -260,7 +262,8 @@ class _Receiver:
         self._limit.cancel()
         self._on_end(self)
 
-    def _close(self, reason: str) -> None:
+    def close(self, reason: str) -> None:
+        """End the link."""
         self._limit.cancel()
         self._link.close(reason, linger=0.0)
         self._on_end(self)

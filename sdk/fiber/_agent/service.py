@@ -10,7 +10,7 @@ import os
 import pickle
 import signal
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -162,6 +162,16 @@ class AgentService:
             arguments=None if arguments is None else self._blobs.get(arguments),
         )
 
+    def insert_shared(self, buffers: list[memoryview], shared: Sequence[tuple[int, bytes]]) -> None:
+        """Insert the buffers of a packet that are blobs; BlobLacking if one is not here."""
+        for position, digest in shared:
+            try:
+                blob = self._blobs.get(digest)
+            except BlobLacking:
+                self.send(Lacking(digest))
+                raise
+            buffers.insert(position, memoryview(contents(blob.fileno())))
+
     def forget(self, child: int) -> None:
         """Forget a child that is gone; if the agent ends and this was the last child, finish."""
         del self._children[child]
@@ -260,7 +270,7 @@ class _Observed:
         child = self._child
         if child is None:
             return  # the child could not be started, and its report is on the way
-        if isinstance(message, messages.Deliver):
+        if isinstance(message, messages.Deliver | messages.DeliverShared):
             self._delivered += 1
             buffers = [memoryview(buffer) for buffer in message.buffers]
             for buffer in buffers:
@@ -269,8 +279,10 @@ class _Observed:
                 self.recalled([message.seq])
                 return
             try:
+                if isinstance(message, messages.DeliverShared):
+                    self._service.insert_shared(buffers, message.shared)
                 child.deliver(message.seq, message.payload, buffers)
-            except OSError as error:
+            except (OSError, BlobLacking) as error:
                 child.abort(error)
         elif isinstance(message, messages.Signal):
             child.signal(message.signum)

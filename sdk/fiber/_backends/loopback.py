@@ -95,7 +95,7 @@ class LoopbackBackend:
             hub,
             self._output,
             Placement(self._limit, spread=True),
-            fanout=Fanout(port=0) if config.pass_on == "always" else None,
+            fanout=Fanout(port=0) if self.passes_on else None,
             on_change=self._changed,
             on_lost=self._lost,
             on_leaving=self._leaving,
@@ -118,6 +118,11 @@ class LoopbackBackend:
         for index in range(config.agents):
             self._launch(index)
         loop.call_soon(self._expect)
+
+    @property
+    def passes_on(self) -> bool:
+        """True if agents pass large blobs on, which saves nothing on one machine."""
+        return self._config.pass_on == "always"
 
     @property
     def sends_program(self) -> bool:

@@ -11,8 +11,8 @@ import pickle
 import signal
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from functools import lru_cache
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import lru_cache, partial
 from typing import Protocol
 
 from fiber._agent.interface import OUT_OF_MEMORY, Cause, ChildObserver, ChildSpec, ExitReport
@@ -26,7 +26,7 @@ from fiber._transport.link_protocol import Frame
 from fiber._transport.loop import EventLoop
 from fiber._wire import messages, packet
 from fiber._wire.blob_messages import Holding, Lacking, Unfetched
-from fiber._wire.memory_files import Blob, BytesLike
+from fiber._wire.memory_files import Blob, BytesLike, shared_blob
 from fiber._wire.packet import Message
 
 _SHUTDOWN_GRACE = 0.5
@@ -114,6 +114,10 @@ class RemoteAgent:
         self._children[number] = child
         child.place(self, number)
         self._blobs.send_missing(child.blobs, child.begin)
+
+    def bring(self, blobs: Iterable[Blob], then: Callable[[], None]) -> None:
+        """Call ``then`` once the agent has these blobs."""
+        self._blobs.send_missing(blobs, then)
 
     def describe_pod(self, pod: str, node: str, *, ending: str, disrupted: bool) -> None:
         """Set the facts of the agent's pod, for the reports of its children."""
@@ -257,6 +261,8 @@ class RemoteChild:
         """Packets to deliver after the Start."""
         self._unasked: list[messages.LinkMessage] | None = []
         """Signals and recalls that wait until the Start has left, so as not to overtake it."""
+        self._held: deque[_HeldPacket] = deque()
+        """Packets to deliver after blobs that some of them need."""
         self._delivered = 0
         self._latest: deque[int] = deque(maxlen=_REMEMBERED)
         self._channel: RemoteTaskChannel | None = None
@@ -322,10 +328,33 @@ class RemoteChild:
         if self._agent is None or self._start is not None:
             self._early.append((seq, payload, buffers))
             return True
+        shared = [(at, blob) for at, one in enumerate(buffers) if (blob := shared_blob(one))]
+        if not shared and not self._held:
+            self._note_delivery(seq)
+            self._agent.transmit(messages.Deliver(self._number, seq, payload, buffers))
+            return True
+        packet_ = _HeldPacket(seq, payload, buffers, shared)
+        self._held.append(packet_)
+        self._agent.bring([blob for _, blob in shared], partial(self._release, packet_))
+        return True
+
+    def _note_delivery(self, seq: int) -> None:
         self._delivered += 1
         self._latest.append(seq)
-        self._agent.transmit(messages.Deliver(self._number, seq, payload, buffers))
-        return True
+
+    def _release(self, released: _HeldPacket) -> None:
+        """Send the packets whose blobs the agent has, in their order."""
+        released.is_ready = True
+        while self._held and self._held[0].is_ready and self._agent is not None:
+            ready = self._held.popleft()
+            self._note_delivery(ready.seq)
+            # The blobs are kept until the message has left, so that no Forget passes it.
+            self._agent.transmit(ready.message(self._number), partial(ready.shared.clear))
+
+    def _take_held(self) -> list[int]:
+        held = [one.seq for one in self._held]
+        self._held.clear()
+        return held
 
     def lease_channel(self) -> RemoteTaskChannel | None:
         """Return the task channel for direct use; None if the child has ended."""
@@ -383,7 +412,7 @@ class RemoteChild:
             self.pid, self._asked = message.pid, None
             self.observer.started(message.pid)
         elif isinstance(message, messages.Recalled):
-            self.observer.recalled(list(message.seqs))
+            self.observer.recalled([*message.seqs, *self._take_held()])
         elif isinstance(message, messages.ShownStack):
             self.observer.showed_stack(message.text)
         elif isinstance(message, messages.Measured):
@@ -412,12 +441,39 @@ class RemoteChild:
         if self._channel is not None:
             self._channel.end()
         missed = list(self._latest)[max(0, len(self._latest) - crossed) :]
-        missed += [seq for seq, _, _ in self._early]
+        missed += [seq for seq, _, _ in self._early] + self._take_held()
         self._early.clear()
         report = report._replace(unread=(*report.unread, *missed))
         if self._agent is not None:
             report = self._agent.explain(report)
         self.observer.exited(report)
+
+
+class _HeldPacket:
+    """Packet to a child that waits for the blobs of which it consists, or for earlier packets."""
+
+    def __init__(
+        self,
+        seq: int,
+        payload: BytesLike,
+        buffers: Sequence[memoryview],
+        shared: list[tuple[int, Blob]],
+    ) -> None:
+        self.seq = seq
+        self.shared = shared
+        """Positions of the buffers that are blobs, and the blobs."""
+        self.is_ready = False
+        self._payload = payload
+        self._buffers = buffers
+
+    def message(self, child: int) -> messages.LinkMessage:
+        """Return the message to the child's agent, which has the blobs."""
+        if not self.shared:
+            return messages.Deliver(child, self.seq, self._payload, self._buffers)
+        positions = {at for at, _ in self.shared}
+        others = [one for at, one in enumerate(self._buffers) if at not in positions]
+        digests = [(at, blob.digest) for at, blob in self.shared]
+        return messages.DeliverShared(child, self.seq, digests, self._payload, others)
 
 
 class RemoteTaskChannel:

@@ -124,7 +124,7 @@ class PoolExecutor:
             on_ready=self._ready,
         )
         self._leases_workers = options.max_tasks is None and not options.retryable
-        self._functions = FunctionCache()
+        self._functions = FunctionCache(runtime.backend.passes_on, options.maximum)
         self.calls = Calls(
             self._loop,
             self._scheduler,
@@ -234,6 +234,7 @@ class PoolExecutor:
         call = pickle_call(future, function, args, {}, self.reject)
         if call is not None:
             self._check()
+            self._functions.share(call.buffers)
             self._loop.call_soon(self._broadcast, WorkItem(work.CALLS, future=future), call)
 
     def reject(self, future: TaskFuture, error: BaseException) -> None:

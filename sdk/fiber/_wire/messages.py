@@ -88,6 +88,32 @@ class Deliver(NamedTuple):
         return redacted(self)
 
 
+class DeliverShared(NamedTuple):
+    """Master to agent: a packet some of whose buffers are blobs that the agent has."""
+
+    child: int
+    seq: int
+    shared: Sequence[tuple[int, bytes]]
+    """Positions and digests of these buffers, in the order of the positions."""
+    payload: BytesLike
+    buffers: Sequence[BytesLike] = ()
+    """The other buffers."""
+
+    def encode(self) -> bytes:
+        """Return the frame."""
+        return b"".join(self.pieces())
+
+    def pieces(self) -> Sequence[BytesLike]:
+        """Return the frame in pieces.  The buffers and a large payload are not copied."""
+        head = _DELIVERY.pack(PROTOCOL, _DELIVER_SHARED, self.child, self.seq)
+        head += _COUNT.pack(len(self.shared))
+        head += b"".join([_SHARED_BUFFER.pack(*one) for one in self.shared])
+        return pieces_of(head, self.payload, self.buffers)
+
+    def __repr__(self) -> str:
+        return redacted(self)
+
+
 class FromChild(NamedTuple):
     """Agent to master: a packet from the child's task channel."""
 
@@ -293,6 +319,7 @@ LinkMessage: TypeAlias = (
     | Started
     | Signal
     | Deliver
+    | DeliverShared
     | FromChild
     | Recall
     | Recalled
@@ -313,7 +340,7 @@ LinkMessage: TypeAlias = (
 HubMessage: TypeAlias = TunnelOpen | TunnelData | TunnelClose | MemoryMessage
 """Message between the hubs of both sides."""
 
-ChildRequest: TypeAlias = Deliver | Signal | Recall | Measure
+ChildRequest: TypeAlias = Deliver | DeliverShared | Signal | Recall | Measure
 """Message that asks something of a child."""
 
 
@@ -346,17 +373,21 @@ _START, _STARTED, _SIGNAL, _DELIVER, _FROM_CHILD, _RECALL, _RECALLED, _EXITED = 
 _OUTPUT, _TUNNEL_OPEN, _TUNNEL_DATA, _TUNNEL_CLOSE, _SHUTDOWN = 9, 11, 12, 13, 14
 _MEMORY, _LEAVE, _STACK, _MEASURE, _MEASURED = range(18, 23)
 
+_DELIVER_SHARED = 28
+
 _HEAD = struct.Struct("<BB")
 _NUMBER = struct.Struct("<BBQ")
 _NUMBERS = struct.Struct("<BBQq")
 _DELIVERY = struct.Struct("<BBQQ")
+_COUNT = struct.Struct("<I")
+_SHARED_BUFFER = struct.Struct(f"<I{blob_messages.DIGEST_BYTES}s")
 _USAGE = struct.Struct("<BBQQQ")
 _GRACE = struct.Struct("<BBd")
 
 
 def pieces(message: LinkMessage) -> Sequence[BytesLike]:
     """Return a message's frame.  Large parts are separate pieces, which are not copied."""
-    if isinstance(message, Start | KeepBlob | Deliver | FromChild | TunnelData):
+    if isinstance(message, Start | KeepBlob | Deliver | DeliverShared | FromChild | TunnelData):
         return message.pieces()
     return (message.encode(),)
 
@@ -369,7 +400,10 @@ def lane(message: LinkMessage) -> Hashable:
     """
     if isinstance(message, TunnelData | TunnelClose):
         return (_TUNNEL_DATA, message.tunnel)
-    if isinstance(message, Start | Deliver | FromChild | Recall | Recalled | Exited | ChildOutput):
+    if isinstance(
+        message,
+        Start | Deliver | DeliverShared | FromChild | Recall | Recalled | Exited | ChildOutput,
+    ):
         return (_DELIVER, message.child)
     if isinstance(message, BlobMessage):
         return (blob_messages.KEEP, message.digest)
@@ -414,6 +448,15 @@ def _read_signal(view: memoryview) -> Signal:
 def _read_deliver(view: memoryview) -> Deliver:
     _, _, child, seq = _DELIVERY.unpack_from(view)
     return Deliver(child, seq, *read_packet(view, _DELIVERY.size))
+
+
+def _read_deliver_shared(view: memoryview) -> DeliverShared:
+    _, _, child, seq = _DELIVERY.unpack_from(view)
+    (count,) = _COUNT.unpack_from(view, _DELIVERY.size)
+    start = _DELIVERY.size + _COUNT.size
+    end = start + count * _SHARED_BUFFER.size
+    shared = tuple(_SHARED_BUFFER.iter_unpack(view[start:end]))
+    return DeliverShared(child, seq, shared, *read_packet(view, end))
 
 
 def _read_from_child(view: memoryview) -> FromChild:
@@ -513,6 +556,7 @@ _READERS: dict[int, Callable[[memoryview], LinkMessage]] = {
     _STARTED: _read_started,
     _SIGNAL: _read_signal,
     _DELIVER: _read_deliver,
+    _DELIVER_SHARED: _read_deliver_shared,
     _FROM_CHILD: _read_from_child,
     _RECALL: _read_recall,
     _RECALLED: _read_recalled,

@@ -62,6 +62,11 @@ class KubernetesBackend:
         self._closing = False
         _worker_images.use(True)
 
+    @property
+    def passes_on(self) -> bool:
+        """True if agents pass large blobs on to each other."""
+        return self._config.pass_on != "never"
+
     def child(self, spec: ChildSpec, observer: ChildObserver) -> RemoteChild:
         """Return a child, not started yet, for a pod that has the resources it asks for."""
         pool = spec.resources.pool or self._config.pool
