@@ -12,6 +12,7 @@ import ssl
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -49,6 +50,15 @@ def keep(*values: Any) -> None:
 
 def hash_of_kept(_: object = None) -> str:
     return hashlib.sha256(_kept[0]).hexdigest()
+
+
+def sha(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
+
+
+def add(theta: bytes, seed: int) -> tuple[str, int]:
+    """Return what tells whether the worker has the right arguments."""
+    return sha(theta), seed
 
 
 # Whole programs
@@ -89,6 +99,24 @@ def run_pool(backend: LoopbackBackend) -> float:
 
 def test_the_master_sends_a_few_copies_and_agents_the_others(backend: LoopbackBackend) -> None:
     assert 1 <= run_pool(backend) < COPIES + 1
+
+
+def test_a_function_and_a_broadcast_with_large_arguments_cost_a_few_copies(
+    backend: LoopbackBackend,
+) -> None:
+    theta = os.urandom(LARGE)
+    expected = hashlib.sha256(theta).hexdigest()
+    with fiber.Pool(AGENTS) as pool:
+        pool.broadcast(os.getpid)  # the workers are there
+        before = bytes_to_agents(backend)
+        seeds = range(20 * AGENTS)
+        answers = pool.map(partial(add, theta), seeds, chunksize=1)
+        assert answers == [(expected, seed) for seed in seeds]
+        between = bytes_to_agents(backend)
+        assert pool.broadcast(add, theta + b"!", 0) == [(sha(theta + b"!"), 0)] * AGENTS
+        after = bytes_to_agents(backend)
+    assert 1 <= (between - before) / LARGE < COPIES + 1
+    assert 1 <= (after - between) / LARGE < COPIES + 1
 
 
 @pytest.mark.parametrize("pass_on", ["auto", "never"])
@@ -152,7 +180,8 @@ def test_an_agent_that_gives_a_useless_address_or_key_serves_nobody(
     holding = Fanout.holding
 
     def nonsense(fanout: Fanout, agent: BlobSender, message: Holding) -> None:
-        holding(fanout, agent, message._replace(**{field: "nonsense"})  # type: ignore[arg-type]  # each field is a text)
+        changes: dict[str, Any] = {field: "nonsense"}
+        holding(fanout, agent, message._replace(**changes))
 
     monkeypatch.setattr(Fanout, "holding", nonsense)
     agents = set(backend.agents.agents)
