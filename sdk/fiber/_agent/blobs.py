@@ -41,10 +41,10 @@ from fiber._wire.descriptor import contents
 from fiber._wire.memory_files import Blob
 from fiber.errors import AuthenticationError, FiberError
 
-_REACH = 5.0
+_REACH = 10.0
 """Seconds in which a receiver must have reached a source."""
 
-_KEEPALIVE = Keepalive(heartbeat=1.0, suspect_after=3.0, lost_after=10.0)
+_KEEPALIVE = Keepalive(heartbeat=1.0, suspect_after=5.0, lost_after=15.0)
 """Limits of silence between two agents.  A receiver gives up a source that is suspect."""
 
 _SLOWEST = 64 << 10
