@@ -15,10 +15,11 @@ import census
 import fiber
 from fiber import reduction
 from fiber._agent.blobs import BlobLacking, BlobStore
-from fiber._backends.remote import BlobSender
+from fiber._backends.blobs import BlobSender
 from fiber._runtime import state
 from fiber._runtime.state import SharedArguments
 from fiber._wire import messages
+from fiber._wire.blob_messages import Forget, KeepBlob, Lacking
 from fiber._wire.descriptor import contents
 from fiber._wire.memory_files import Blob
 from memory_link import SimulatedLoop
@@ -91,7 +92,7 @@ def test_the_same_content_made_anew_in_time_is_not_sent_again() -> None:
 def test_a_blob_that_an_agent_could_not_keep_is_sent_again() -> None:
     sent, blob = Sent(), Blob(b"content")
     sent.need(blob)
-    sent.parcels.lost(blob.digest)
+    sent.parcels.on_report(Lacking(blob.digest))
     sent.need(blob)
     assert sent.kinds() == [f"KeepBlob {name(blob)}"] * 2
 
@@ -122,7 +123,7 @@ def test_a_caller_waits_for_the_blobs_that_it_needs_and_for_no_others() -> None:
 def test_a_blob_that_is_sent_again_has_left_when_both_have() -> None:
     sent, blob = Sent(), Blob(b"content")
     sent.need(blob)
-    sent.parcels.lost(blob.digest)
+    sent.parcels.on_report(Lacking(blob.digest))
     sent.need(blob, caller="again")
     sent.leave()
     assert sent.ready == []
