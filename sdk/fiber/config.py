@@ -91,10 +91,10 @@ class Config:
         port forwarding. The port is the same. None means the address above.
     relay*: whether pods connect to a relay, a pod that the program reaches through the API server:
         "always", "never", or "auto", which means if no pod reaches the program within seconds.
-    pass_on*: whether agents pass large initial arguments, functions, broadcasts and program files on
-        to each other, so that the program sends them to a few agents only: "always", "never", or "auto", which means
-        on Kubernetes. Pods do it at port 7073. If they do not reach each other there, the program
-        sends all copies.
+    pass_on*: whether agents pass large initial arguments, functions, broadcasts and program files
+        on to each other, so that the program sends them to a few agents only: "always", "never",
+        or "auto", which means on Kubernetes. Pods do it at port 7073. If they do not reach each
+        other there, the program sends all copies.
     start_timeout: seconds that a process or an agent may take to start.
     heartbeat_interval*: seconds between two heartbeats of an agent.
     suspect_after*: seconds of silence after which an agent gets no new work.
