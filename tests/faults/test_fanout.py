@@ -196,7 +196,7 @@ DIGEST = hashlib.sha256(DATA).digest()
 
 @dataclass
 class Result:
-    """What came of a transfer."""
+    """Result of a transfer."""
 
     done: threading.Event = field(default_factory=threading.Event)
     data: bytes = b""
