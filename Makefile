@@ -109,6 +109,7 @@ bench-operator: $(VENV)/.with-dev
 bench-kubernetes: $(VENV)/.with-bench $(VENV)/.with-dev
 	PYTHONPATH=tests $(BIN)/python -m benchmarks.kubernetes_cluster
 	$(BIN)/python -m benchmarks.relay_memory
+	$(BIN)/python -m benchmarks.fanout
 
 ## make paper         the paper's experiments beside the peers; writes docs/paper.md and docs/paper
 paper: $(VENV)/.with-bench $(VENV)/.with-stable-baselines3 $(VENV)/.with-games

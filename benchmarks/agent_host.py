@@ -85,7 +85,12 @@ class AgentHost:
         agent: Any = FakeAgent(self._loop, "fake", self._runner)
         hub: Any = _NoHub()
         service = AgentService(
-            self._loop, link, agent, hub, lambda *_: link.close("it ended", then=self._ended)
+            self._loop,
+            link,
+            agent,
+            hub,
+            lambda *_: link.close("it ended", then=self._ended),
+            reached_at="127.0.0.1",
         )
         self._services.append(service)
         link.attach(service)

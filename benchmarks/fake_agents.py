@@ -42,6 +42,7 @@ class FakeBackend:
     same_pids = True
     elastic = False
     sends_program = False
+    passes_on = False
 
     def __init__(self, agent: FakeAgent) -> None:
         self._agent = agent

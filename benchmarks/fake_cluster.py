@@ -18,6 +18,7 @@ from benchmarks.agent_host import Order
 
 from fiber._agent.interface import ChildObserver, ChildSpec
 from fiber._backends.agent_set import AgentSet
+from fiber._backends.blobs import Fanout
 from fiber._backends.remote import RemoteAgent, RemoteChild
 from fiber._engine.placement import Placement
 from fiber._logs import OutputWriter
@@ -41,7 +42,7 @@ class FakeCluster:
 
     `joined` is the seconds that all agents took to join, from the order to dial. `joining` is the
     processor time that this process used meanwhile. `master_memory` and `agent_memory` are the
-    bytes that a link costs either side, as PSS.
+    bytes that a link costs either side, as PSS. `fanout` lets the agents pass on blobs.
     """
 
     name = "fake"
@@ -49,8 +50,11 @@ class FakeCluster:
     same_pids = True
     elastic = False
     sends_program = False
+    passes_on = False
 
-    def __init__(self, runtime: Runtime, hosts: Sequence[Host], agents: int) -> None:
+    def __init__(
+        self, runtime: Runtime, hosts: Sequence[Host], agents: int, fanout: Fanout | None = None
+    ) -> None:
         assert runtime.hub is not None
         self._hosts = hosts
         self._output = OutputWriter()
@@ -58,7 +62,12 @@ class FakeCluster:
         self._names = [f"fake-{number}" for number in range(agents)]
         placement: Placement[RemoteAgent, RemoteChild] = Placement(math.inf, spread=True)
         self._agents = AgentSet(
-            runtime.loop, runtime.hub, self._output, placement, on_lost=self._lost
+            runtime.loop,
+            runtime.hub,
+            self._output,
+            placement,
+            fanout=fanout,
+            on_lost=self._lost,
         )
         self._missing = agents
         self._all_joined = threading.Event()
@@ -106,6 +115,11 @@ class FakeCluster:
     def child(self, spec: ChildSpec, observer: ChildObserver) -> RemoteChild:
         """Return a child of the agent that has the fewest."""
         return self._agents.child(spec, observer)
+
+    @property
+    def agents(self) -> list[RemoteAgent]:
+        """Agents that have joined."""
+        return list(self._agents.agents.values())
 
     def close(self) -> None:
         """End the agents, and with them their hosts; hosts that never began do not matter."""

@@ -125,6 +125,9 @@ MASTER_PORT: Final = 7070
 MASTER_PORT_NAME: Final = "fiber"
 ENDPOINT_SCHEME: Final = "tls+tcp"
 
+PEER_PORT: Final = 7073
+"""Port at which the agent in a pod serves large blobs to other agents."""
+
 # -- The relay, for programs that pods cannot reach
 
 LABEL_RELAY: Final = f"{GROUP}/relay"

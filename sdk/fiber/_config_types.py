@@ -9,6 +9,7 @@ from typing import Any, Literal, TypedDict
 Backend = Literal["local", "loopback", "kubernetes", "auto"]
 Progress = Literal["auto", "always", "never"]
 Relay = Literal["auto", "always", "never"]
+PassOn = Literal["auto", "always", "never"]
 LogLevel = Literal["DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL"]
 
 
@@ -36,6 +37,7 @@ class ConfigKeywords(TypedDict, total=False):
     listen_port: int | str
     advertised_host: str | None
     relay: Relay
+    pass_on: PassOn
     start_timeout: float
     heartbeat_interval: float
     suspect_after: float

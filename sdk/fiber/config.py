@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Unpack, get_args
 
 from fiber import _config_rules as rules
 from fiber import _config_sources, resources
-from fiber._config_types import Backend, LogLevel, Progress, Relay
+from fiber._config_types import Backend, LogLevel, PassOn, Progress, Relay
 from fiber.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -91,6 +91,10 @@ class Config:
         port forwarding. The port is the same. None means the address above.
     relay*: whether pods connect to a relay, a pod that the program reaches through the API server:
         "always", "never", or "auto", which means if no pod reaches the program within seconds.
+    pass_on*: whether agents pass large initial arguments, functions, broadcasts and program files
+        on to each other, so that the program sends them to a few agents only: "always", "never",
+        or "auto", which means on Kubernetes. Pods do it at port 7073. If they do not reach each
+        other there, the program sends all copies.
     start_timeout: seconds that a process or an agent may take to start.
     heartbeat_interval*: seconds between two heartbeats of an agent.
     suspect_after*: seconds of silence after which an agent gets no new work.
@@ -157,6 +161,7 @@ class Config:
     listen_port: int | str = _key(0, rules.ports(), fixed=True)
     advertised_host: str | None = _key(None, rules.word("a host name or address"), fixed=True)
     relay: Relay = _key("auto", rules.choice(*get_args(Relay)), fixed=True)  # noqa: RUF009 - a field
+    pass_on: PassOn = _key("auto", rules.choice(*get_args(PassOn)), fixed=True)  # noqa: RUF009 - a field
     start_timeout: float = _key(60.0, rules.seconds())
     heartbeat_interval: float = _key(1.0, rules.seconds(), fixed=True)
     suspect_after: float = _key(5.0, rules.seconds(), fixed=True)

@@ -43,11 +43,24 @@ def test_the_policy_closes_the_pods_of_workers(helm: Helm) -> None:
     (label,) = spec["podSelector"]["matchExpressions"]
     assert label == {"key": names.LABEL_POOL_UID, "operator": "Exists"}
     assert spec["policyTypes"] == ["Ingress", "Egress"]
-    assert "ingress" not in spec
+
+
+def test_workers_reach_each_other_at_the_port_for_large_blobs(helm: Helm) -> None:
+    worker = podspec.pod(make_pool(), "es-1", ADDRESS)
+    spec = policy(helm)
+    (rule,) = spec["ingress"]
+    for peers, ports in (
+        (rule["from"], rule["ports"]),
+        (spec["egress"][2]["to"], spec["egress"][2]["ports"]),
+    ):
+        (peer,) = peers
+        assert chosen(peer, worker)
+        assert not chosen(peer, relays_pod())
+        assert ports == [{"port": names.PEER_PORT, "protocol": "TCP"}]
 
 
 def test_workers_reach_their_master_relays_and_dns(helm: Helm) -> None:
-    master, relays, dns = policy(helm, masterPorts=[4000])["egress"]
+    master, relays, _, dns = policy(helm, masterPorts=[4000])["egress"]
     assert master == {"to": [{"podSelector": {}}], "ports": [{"port": 4000, "protocol": "TCP"}]}
     (peer,) = relays["to"]
     assert chosen(peer, relays_pod())

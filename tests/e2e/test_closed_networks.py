@@ -17,6 +17,7 @@ from e2e.leftovers import leaves_nothing
 from e2e.program import Programs
 from e2e.release import Release
 from e2e.scene import Scene
+from fiber_api import names
 
 pytestmark = pytest.mark.timeout(240, func_only=True)
 
@@ -44,7 +45,8 @@ def test_workers_reach_only_their_program(
     peer = SAME_NAMESPACE if place == "inside" else {"ipBlock": {"cidr": host}}
     policy = workers_policy(release, scene.namespace, peer)
     scene.kube.create(path_of("networkpolicies", scene.namespace), policy)
-    assert "ingress" not in policy["spec"]
+    (incoming,) = policy["spec"]["ingress"]
+    assert [port["port"] for port in incoming["ports"]] == [names.PEER_PORT]
     with ExitStack() as closed:
         if place == "inside":
             ports = [int(server.rpartition(":")[2]) for server in servers]

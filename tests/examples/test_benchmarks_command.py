@@ -79,6 +79,14 @@ def test_an_interrupt_leaves_no_processes_or_files(tmp_path: Path, scratch: Path
     assert not list(scratch.iterdir())
 
 
+def test_the_way_of_a_large_blob_is_measured() -> None:
+    few = ["--agents", "6", "--size", "1100000", "--simulated", "50"]
+    measure = [sys.executable, "-m", "benchmarks.fanout", *few]
+    done = subprocess.run(measure, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE)
+    assert "real links, 6 agents" in done.stdout, done.stderr
+    assert "most copies of the master: 4.0" in done.stdout
+
+
 def test_the_memory_of_a_relay_is_measured() -> None:
     measure = [sys.executable, "-m", "benchmarks.relay_memory", "--agents", "3"]
     done = subprocess.run(measure, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE)

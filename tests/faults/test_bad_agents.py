@@ -16,7 +16,7 @@ import pytest
 from faults.program import Program
 from fiber._transport import authentication
 from fiber._transport.credentials import make_credentials
-from fiber._wire import messages
+from fiber._wire.packet_layout import PROTOCOL
 from patience import PATIENCE
 
 AGENT = """
@@ -97,7 +97,7 @@ def test_an_agent_with_wrong_credentials_gives_up_early(
         ),
         (
             "import fiber._transport.authentication as h; h.PROTOCOL = 999",
-            str(messages.PROTOCOL),
+            str(PROTOCOL),
             "999",
         ),
     ],

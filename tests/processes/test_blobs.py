@@ -14,11 +14,12 @@ import pytest
 import census
 import fiber
 from fiber import reduction
-from fiber._agent.service import BlobLacking, BlobStore
-from fiber._backends.remote import BlobSender
+from fiber._agent.blobs import BlobLacking, BlobStore
+from fiber._backends.blobs import BlobSender
 from fiber._runtime import state
 from fiber._runtime.state import SharedArguments
 from fiber._wire import messages
+from fiber._wire.blob_messages import Forget, KeepBlob, Lacking
 from fiber._wire.descriptor import contents
 from fiber._wire.memory_files import Blob
 from memory_link import SimulatedLoop
@@ -91,7 +92,7 @@ def test_the_same_content_made_anew_in_time_is_not_sent_again() -> None:
 def test_a_blob_that_an_agent_could_not_keep_is_sent_again() -> None:
     sent, blob = Sent(), Blob(b"content")
     sent.need(blob)
-    sent.parcels.lost(blob.digest)
+    sent.parcels.on_report(Lacking(blob.digest))
     sent.need(blob)
     assert sent.kinds() == [f"KeepBlob {name(blob)}"] * 2
 
@@ -99,7 +100,7 @@ def test_a_blob_that_an_agent_could_not_keep_is_sent_again() -> None:
 def test_no_agent_costs_a_copy_of_the_content() -> None:
     content = b"content"
     blob = Blob(content)
-    message = messages.KeepBlob(blob.digest, blob.data)
+    message = KeepBlob(blob.digest, blob.data)
     assert messages.decode(message.encode()) == message
     assert messages.pieces(message)[-1] is content
     assert bytes(contents(blob.fileno())) == content
@@ -122,7 +123,7 @@ def test_a_caller_waits_for_the_blobs_that_it_needs_and_for_no_others() -> None:
 def test_a_blob_that_is_sent_again_has_left_when_both_have() -> None:
     sent, blob = Sent(), Blob(b"content")
     sent.need(blob)
-    sent.parcels.lost(blob.digest)
+    sent.parcels.on_report(Lacking(blob.digest))
     sent.need(blob, caller="again")
     sent.leave()
     assert sent.ready == []
@@ -133,7 +134,7 @@ def test_a_blob_that_is_sent_again_has_left_when_both_have() -> None:
 @pytest.mark.parametrize("data", [b"", b"content"])
 def test_a_store_keeps_a_blob_until_the_release(data: bytes, tmp_path: Any) -> None:
     store, digest = BlobStore(str(tmp_path)), Blob(data).digest
-    store.put(messages.KeepBlob(digest, data))
+    store.put(KeepBlob(digest, data))
     held = store.get(digest)
     store.forget(digest)
     with pytest.raises(BlobLacking, match="it was forgotten"):
@@ -148,7 +149,7 @@ def test_a_store_without_room_says_so_once_and_keeps_the_next(
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    store, message = BlobStore(str(tmp_path)), messages.KeepBlob(Blob(b"x").digest, b"x")
+    store, message = BlobStore(str(tmp_path)), KeepBlob(Blob(b"x").digest, b"x")
     monkeypatch.setattr(Blob, "in_file", full)
     store.put(message)
     with pytest.raises(BlobLacking, match="No space left on device") as caught:
@@ -262,7 +263,7 @@ def test_a_worker_whose_arguments_are_lost_is_started_anew_with_them(backend: An
     assert census.wait_until(lambda: "loopback-0" in backend.agents.agents, PATIENCE)
     agent = backend.agents.agents["loopback-0"]
     backend._loop.call_soon(agent._blobs.send_missing, [blob], lambda: None)
-    agent.send(messages.Forget(blob.digest))
+    agent.send(Forget(blob.digest))
     with fiber.Pool(1, keep, (bytes(LARGE),)) as pool:
         assert pool.apply(size_of_kept) == LARGE
     assert state.runtime().backend is backend

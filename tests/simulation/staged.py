@@ -42,6 +42,7 @@ class Stage:
         self.loop = world.loop
         self.config = SimpleNamespace(start_timeout=1.0)
         self.elastic = False
+        self.backend = SimpleNamespace(passes_on=False)
         self.activity = Activity(0.0)
         self.pools: set[object] = set()
         self.rng = random.Random(f"{world.schedule.seed} stage")

@@ -203,6 +203,7 @@ class Rig:
             loop=self.loop,
             start=self._start,
             elastic=False,
+            backend=SimpleNamespace(passes_on=False),
             activity=Activity(0.0),
             pools=set(),
             look_at_program=lambda: None,

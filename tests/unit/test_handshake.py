@@ -17,7 +17,8 @@ from fiber._transport.authentication import (
     decode_greeting,
     version_mismatch,
 )
-from fiber._wire.messages import PROTOCOL, ProtocolError
+from fiber._wire.messages import ProtocolError
+from fiber._wire.packet_layout import PROTOCOL
 
 OURS = Identity("the master", PROTOCOL, "3.11.7", "1.0", {"host": "here"})
 

@@ -10,16 +10,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fiber._agent.interface import Cause
-from fiber._wire.messages import (
+from fiber._wire.blob_messages import (
     DIGEST_BYTES,
-    PROTOCOL,
-    ChildOutput,
-    Deliver,
-    Exited,
+    Fetch,
     Forget,
-    FromChild,
+    Holding,
     KeepBlob,
     Lacking,
+    Serve,
+    Unfetched,
+    Want,
+)
+from fiber._wire.messages import (
+    ChildOutput,
+    Deliver,
+    DeliverShared,
+    Exited,
+    FromChild,
     Leave,
     LinkMessage,
     Measure,
@@ -37,6 +44,7 @@ from fiber._wire.messages import (
     decode,
     lane,
 )
+from fiber._wire.packet_layout import PROTOCOL
 
 SECRET = "the user's own"
 
@@ -54,9 +62,22 @@ messages: st.SearchStrategy[LinkMessage] = st.one_of(
     st.builds(Forget, digests),
     st.builds(Leave, st.floats(allow_nan=False), any_text),
     st.builds(Lacking, digests),
+    st.builds(Serve, digests, ids),
+    st.builds(Fetch, digests, ids, ids, any_text, any_text, any_text, any_text, ids),
+    st.builds(Holding, digests, any_text, any_text, any_text),
+    st.builds(Unfetched, digests, ids, any_text),
+    st.builds(Want, digests),
     st.builds(Started, ids, numbers),
     st.builds(Signal, ids, numbers),
     st.builds(Deliver, ids, ids, data, buffers),
+    st.builds(
+        DeliverShared,
+        ids,
+        ids,
+        st.lists(st.tuples(st.integers(0, 2**32 - 1), digests), max_size=3).map(tuple),
+        data,
+        buffers,
+    ),
     st.builds(FromChild, ids, data, buffers),
     st.builds(Recall, ids),
     st.builds(Measure, ids),
@@ -102,7 +123,7 @@ def test_a_damaged_frame_raises_only_protocol_error(
         pass
 
 
-@given(st.integers(0, 20), data)
+@given(st.integers(0, 30), data)
 def test_noise_of_any_kind_raises_only_protocol_error(kind: int, noise: bytes) -> None:
     try:
         decode(bytes([PROTOCOL, kind]) + noise)
@@ -186,8 +207,22 @@ def test_buffers_of_any_item_size_are_taken_by_their_bytes() -> None:
             "KeepBlob(digest=<32 bytes>, data=<14 bytes>)",
         ),
         (
+            Fetch(bytes(DIGEST_BYTES), 1, 2, "host:1", "word", SECRET, "hash", 3),
+            "Fetch(digest=<32 bytes>, number=1, size=2, address=<6 characters>, "
+            "uid=<4 characters>, key=<14 characters>, certificate=<4 characters>, port=3)",
+        ),
+        (
+            Holding(bytes(DIGEST_BYTES), "host:1", SECRET, "hash"),
+            "Holding(digest=<32 bytes>, address=<6 characters>, key=<14 characters>, "
+            "certificate=<4 characters>)",
+        ),
+        (
             Deliver(3, 4, SECRET.encode(), [SECRET.encode()]),
             "Deliver(child=3, seq=4, payload=<14 bytes>, buffers=<1 items>)",
+        ),
+        (
+            DeliverShared(3, 4, [(0, bytes(DIGEST_BYTES))], SECRET.encode()),
+            "DeliverShared(child=3, seq=4, shared=<1 items>, payload=<14 bytes>, buffers=())",
         ),
         (
             FromChild(3, memoryview(SECRET.encode())),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import hashlib
 import signal
 from collections.abc import Callable
 from typing import Any
@@ -13,7 +15,7 @@ from fiber._agent.interface import ChildSpec
 from fiber._backends.remote import RemoteAgent, RemoteChild
 from fiber._transport.link_protocol import Lane
 from fiber._wire import messages
-from fiber._wire.memory_files import BytesLike
+from fiber._wire.memory_files import BytesLike, share
 from memory_link import SimulatedLoop
 from unit.agent_children import ReadLink, Recorder
 
@@ -78,6 +80,79 @@ def test_a_child_whose_end_is_not_reported_ends_with_the_link_of_its_agent() -> 
     assert observer.report is not None
 
 
+def shared_packet() -> memoryview:
+    buffer = memoryview(bytes(range(256)))
+    share(buffer)
+    return buffer
+
+
+def running_child(link: Large) -> tuple[SimulatedLoop, RemoteAgent, RemoteChild, Recorder]:
+    nothing: Any = mock.MagicMock()
+    loop, observer = SimulatedLoop(), Recorder()
+    agent = RemoteAgent("far", link, loop, nothing, nothing, nothing)  # type: ignore[arg-type]
+    child = RemoteChild(agent, ChildSpec("child", "fork", b"", b"", tasks=True), observer)
+    child.start()
+    loop.run_for(0)
+    for _ in ("the preparation", "the start"):
+        for left in link.take_leaving():
+            left()
+    link.sent.clear()
+    return loop, agent, child, observer
+
+
+def test_a_packet_waits_for_its_blobs_and_later_packets_for_it() -> None:
+    link, large = Large(), shared_packet()
+    _, _, child, _ = running_child(link)
+    child.deliver(1, b"first")
+    child.deliver(2, b"second", [memoryview(b"small"), large])
+    child.deliver(3, b"third")
+    assert link.kinds() == ["Deliver", "KeepBlob"]
+    for left in link.take_leaving():
+        left()
+    assert link.kinds() == ["Deliver", "KeepBlob", "DeliverShared", "Deliver"]
+    shared = link.sent[2]
+    assert isinstance(shared, messages.DeliverShared)
+    digest = hashlib.sha256(large).digest()
+    assert (shared.seq, shared.shared, len(shared.buffers)) == (2, ((1, digest),), 1)
+
+
+@pytest.mark.parametrize("how", ["recalled", "ended"])
+def test_packets_that_wait_for_a_blob_are_given_back(how: str) -> None:
+    link, large = Large(), shared_packet()
+    _, agent, child, observer = running_child(link)
+    child.deliver(2, b"second", [large])
+    child.deliver(3, b"third")
+    if how == "recalled":
+        agent.on_frame(bytearray(messages.Recalled(1, (1,)).encode()))
+        assert observer.unread == [1, 2, 3]
+    else:
+        agent.on_lost("the pod was deleted")
+        assert observer.report is not None
+        assert observer.report.unread == (2, 3)
+    for left in link.take_leaving():
+        left()
+    assert "DeliverShared" not in link.kinds()
+
+
+def test_a_blob_is_kept_until_the_packet_that_names_it_has_left() -> None:
+    link, large = Large(), shared_packet()
+    loop, _, child, _ = running_child(link)
+    child.deliver(2, b"second", [large])
+    del large
+    (left,) = link.take_leaving()
+    left()
+    del left
+    gc.collect()
+    loop.run_for(0)
+    assert link.kinds() == ["KeepBlob", "DeliverShared"]
+    for left in link.take_leaving():
+        left()
+    del left
+    gc.collect()
+    loop.run_for(0)
+    assert link.kinds() == ["KeepBlob", "DeliverShared", "Forget"]
+
+
 class Large(ReadLink):
     """A link on which blobs and starts are large: they leave when the test says so."""
 
@@ -91,6 +166,11 @@ class Large(ReadLink):
         super().send(*frame, lane=lane)
         if on_left is not None:
             self.leaving.append(on_left)
+
+    def take_leaving(self) -> list[Callable[[], None]]:
+        """Return what is to be called for all messages that have not left."""
+        taken, self.leaving = self.leaving, []
+        return taken
 
     def kinds(self) -> list[str]:
         return [type(message).__name__ for message in self.sent]

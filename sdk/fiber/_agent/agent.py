@@ -276,6 +276,7 @@ class LocalBackend(Agent):
     same_host = True
     same_pids = True
     sends_program = False
+    passes_on = False
 
 
 _SEQ = struct.Struct("<Q")

@@ -223,6 +223,10 @@ class Backend(Protocol):
     def sends_program(self) -> bool:
         """True if the agents need the program's files for their children."""
 
+    @property
+    def passes_on(self) -> bool:
+        """True if agents pass large blobs on to each other, so that it pays to make blobs."""
+
     def child(self, spec: ChildSpec, observer: ChildObserver) -> ChildHandle:
         """Return a child, not started yet; raise errors that are known already.  Any thread."""
 

@@ -188,7 +188,9 @@ class Main:
 
     def _joined(self, link: Link) -> None:
         keep_search_path()  # before the first task
-        self._service = AgentService(self._loop, link, self._agent, self._hub, self._ended)
+        self._service = AgentService(
+            self._loop, link, self._agent, self._hub, self._ended, self._dialer.local_host
+        )
         self._link = link
         link.attach(self._service)
         if self._linked:

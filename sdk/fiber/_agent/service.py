@@ -1,7 +1,6 @@
 """The agent's side of its link: obeys the master's messages and reports the children's events.
 
-It also reads the output of remote children by lines, and keeps the blobs that the master sent for
-children that the agent starts.
+It also reads the output of remote children by lines.
 """
 
 from __future__ import annotations
@@ -11,13 +10,14 @@ import os
 import pickle
 import signal
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
 from fiber import config
 from fiber._agent.agent import Agent, LocalChild
+from fiber._agent.blobs import BlobExchange, BlobLacking, BlobStore
 from fiber._agent.interface import Cause, ChildSpec, ExitReport
 from fiber._agent.last_words import TELL, signal_masks
 from fiber._agent.usage import Usage
@@ -27,8 +27,9 @@ from fiber._transport.link import Link
 from fiber._transport.link_protocol import Frame
 from fiber._transport.loop import Loop
 from fiber._wire import messages, packet
+from fiber._wire.blob_messages import Fetch, Forget, KeepBlob, Lacking, Serve
 from fiber._wire.descriptor import contents
-from fiber._wire.memory_files import Blob, BytesLike, pass_on, place_of
+from fiber._wire.memory_files import BytesLike, pass_on, place_of
 
 _KNOWN_HERE = ExitReport._fields.index("pod")
 """Number of fields of an exit report that an agent sends; the master adds the others."""
@@ -42,11 +43,18 @@ the agent stops reading from the child.
 class AgentService:
     """Service of one master until the link ends; a ``LinkObserver``.  Runs on the loop thread.
 
-    ``on_end`` gets the reason of the end, and whether the master was lost.
+    ``on_end`` gets the reason of the end, and whether the master was lost.  ``reached_at`` is the
+    address at which other agents may reach this one, empty if there is none.
     """
 
     def __init__(
-        self, loop: Loop, link: Link, agent: Agent, hub: Hub, on_end: Callable[[str, bool], None]
+        self,
+        loop: Loop,
+        link: Link,
+        agent: Agent,
+        hub: Hub,
+        on_end: Callable[[str, bool], None],
+        reached_at: str = "",
     ) -> None:
         self._loop = loop
         self._hub = hub
@@ -55,6 +63,7 @@ class AgentService:
         self._agent = agent
         self._on_end = on_end
         self._blobs = BlobStore(config.current().runtime_directory)
+        self._exchange = BlobExchange(loop, self._blobs, reached_at, self.send)
         self._children: dict[int, _Observed] = {}
         self._leaving = False
         self._stopping = False
@@ -82,9 +91,14 @@ class AgentService:
         message = messages.decode(frame)
         if isinstance(message, messages.Start):
             self._start(message)
-        elif isinstance(message, messages.KeepBlob):
+        elif isinstance(message, KeepBlob):
             self._blobs.put(message)
-        elif isinstance(message, messages.Forget):
+        elif isinstance(message, Serve):
+            self._exchange.serve(message)
+        elif isinstance(message, Fetch):
+            self._exchange.fetch(message)
+        elif isinstance(message, Forget):
+            self._exchange.forget(message)
             self._blobs.forget(message.digest)
         elif isinstance(message, messages.Shutdown):
             self.stop("the master ended", message.grace)
@@ -118,7 +132,7 @@ class AgentService:
             with naming_the_limit("starting a process"):
                 spec = self._specification(message.process, *pickle.loads(message.spec))
         except BlobLacking as error:
-            self.send(messages.Lacking(error.digest))
+            self.send(Lacking(error.digest))
             child.refuse(self._agent.host, error)
         except OSError as error:
             child.refuse(self._agent.host, error)
@@ -147,6 +161,16 @@ class AgentService:
             program=None if program is None else self._blobs.get(program),
             arguments=None if arguments is None else self._blobs.get(arguments),
         )
+
+    def insert_shared(self, buffers: list[memoryview], shared: Sequence[tuple[int, bytes]]) -> None:
+        """Insert the buffers of a packet that are blobs; BlobLacking if one is not here."""
+        for position, digest in shared:
+            try:
+                blob = self._blobs.get(digest)
+            except BlobLacking:
+                self.send(Lacking(digest))
+                raise
+            buffers.insert(position, memoryview(contents(blob.fileno())))
 
     def forget(self, child: int) -> None:
         """Forget a child that is gone; if the agent ends and this was the last child, finish."""
@@ -194,6 +218,7 @@ class AgentService:
         if self._ended:
             return
         self._ended = True
+        self._exchange.close()
         self._on_end(self._reason, self._lost)
 
     def _signal_all(self, signum: int) -> None:
@@ -245,7 +270,7 @@ class _Observed:
         child = self._child
         if child is None:
             return  # the child could not be started, and its report is on the way
-        if isinstance(message, messages.Deliver):
+        if isinstance(message, messages.Deliver | messages.DeliverShared):
             self._delivered += 1
             buffers = [memoryview(buffer) for buffer in message.buffers]
             for buffer in buffers:
@@ -254,8 +279,10 @@ class _Observed:
                 self.recalled([message.seq])
                 return
             try:
+                if isinstance(message, messages.DeliverShared):
+                    self._service.insert_shared(buffers, message.shared)
                 child.deliver(message.seq, message.payload, buffers)
-            except OSError as error:
+            except (OSError, BlobLacking) as error:
                 child.abort(error)
         elif isinstance(message, messages.Signal):
             child.signal(message.signum)
@@ -406,50 +433,6 @@ class Capture:
             texts = [line.decode(errors="replace").removesuffix("\r") for line in lines]
             self._lines.extend(texts)
             self._write("\n".join(texts))
-
-
-class BlobLacking(Exception):
-    """Error: the agent does not have a blob.  The text says why."""
-
-    def __init__(self, digest: bytes, reason: str) -> None:
-        super().__init__(f"what its master sent ahead is not there: {reason}")
-        self.digest = digest
-
-
-class BlobStore:
-    """Blobs of one master, in files in ``directory``, until the master sends Forget.
-
-    Frames come in order.  A blob that is sent before a Start is here when the Start comes.  A child
-    that was started before a Forget still has the blob open.
-    """
-
-    def __init__(self, directory: str | None) -> None:
-        self._directory = directory
-        self._blobs: dict[bytes, Blob] = {}
-        self._refused: dict[bytes, str] = {}
-        """Blobs for which the system had no room, and the reasons."""
-
-    def put(self, message: messages.KeepBlob) -> None:
-        """Keep a blob.  If the system refuses that, ``get`` raises the reason."""
-        try:
-            blob = Blob.in_file(message.digest, message.data, self._directory)
-        except OSError as error:
-            self._refused[message.digest] = str(error)
-            return
-        self._refused.pop(message.digest, None)
-        self._blobs[message.digest] = blob
-
-    def get(self, digest: bytes) -> Blob:
-        """Return a blob that was sent; raise BlobLacking if it is not here."""
-        blob = self._blobs.get(digest)
-        if blob is None:
-            raise BlobLacking(digest, self._refused.pop(digest, "it was forgotten"))
-        return blob
-
-    def forget(self, digest: bytes) -> None:
-        """Delete a blob, which no later Start names."""
-        self._blobs.pop(digest, None)
-        self._refused.pop(digest, None)
 
 
 def is_expected(pid: int, signum: int) -> bool:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 from fiber import _logs
 from fiber._agent.interface import Cause, ChildObserver, ChildSpec, ExitReport
+from fiber._backends.blobs import Fanout
 from fiber._backends.remote import RemoteAgent, RemoteChild
 from fiber._engine.placement import Placement
 from fiber._hub.hub import Hub
@@ -20,7 +21,8 @@ class AgentSet:
 
     ``on_change`` is called when the number of wanted agents may have changed.  ``on_lost`` gets a
     lost agent and the reason, before its children end.  ``on_leaving`` gets an agent that takes no
-    new work.  Any thread may call ``child``.  All else runs on the loop thread.
+    new work.  ``fanout`` lets agents serve blobs to each other.  Any thread may call ``child``.
+    All else runs on the loop thread.
     """
 
     def __init__(
@@ -30,6 +32,7 @@ class AgentSet:
         output: OutputWriter,
         placement: Placement[RemoteAgent, RemoteChild],
         *,
+        fanout: Fanout | None = None,
         on_change: Callable[[], None] = lambda: None,
         on_lost: Callable[[RemoteAgent, str], None] = lambda agent, reason: None,
         on_leaving: Callable[[RemoteAgent], None] = lambda agent: None,
@@ -46,6 +49,7 @@ class AgentSet:
         self._successor: Callable[[], AgentSet] | None = None
         self._hub = hub
         self._output = output
+        self._fanout = fanout
         self._on_change = on_change
         self._on_lost = on_lost
         self._on_leaving = on_leaving
@@ -84,7 +88,7 @@ class AgentSet:
 
     def join(self, host: str, link: Link) -> RemoteAgent:
         """Add an agent that has dialed in."""
-        agent = RemoteAgent(host, link, self.loop, self._hub, self._output, self)
+        agent = RemoteAgent(host, link, self.loop, self._hub, self._output, self, self._fanout)
         _logs.debug("agent %s has joined", host)
         self.agents[host] = agent
         self.joined += 1

@@ -25,6 +25,7 @@ from typing import NamedTuple
 from fiber._agent.interface import ChildObserver, ChildSpec
 from fiber._agent.zygote_process import interpreter_arguments
 from fiber._backends.agent_set import AgentSet
+from fiber._backends.blobs import Fanout
 from fiber._backends.remote import RemoteAgent, RemoteChild
 from fiber._engine.placement import Placement
 from fiber._engine.start_failures import StartFailure, StartFailures
@@ -94,6 +95,7 @@ class LoopbackBackend:
             hub,
             self._output,
             Placement(self._limit, spread=True),
+            fanout=Fanout(port=0) if self.passes_on else None,
             on_change=self._changed,
             on_lost=self._lost,
             on_leaving=self._leaving,
@@ -116,6 +118,11 @@ class LoopbackBackend:
         for index in range(config.agents):
             self._launch(index)
         loop.call_soon(self._expect)
+
+    @property
+    def passes_on(self) -> bool:
+        """True if agents pass large blobs on, which saves nothing on one machine."""
+        return self._config.pass_on == "always"
 
     @property
     def sends_program(self) -> bool:

@@ -1,8 +1,7 @@
 """Agents behind links and their children, as the master sees them.
 
 ``RemoteAgent`` is an agent that has connected. ``RemoteChild`` is a child on its host, and
-``RemoteTaskChannel`` the child's task channel. ``BlobSender`` sends the blobs that the agent's
-children need.
+``RemoteTaskChannel`` the child's task channel.
 """
 
 from __future__ import annotations
@@ -11,7 +10,6 @@ import itertools
 import pickle
 import signal
 import threading
-import weakref
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import lru_cache, partial
@@ -19,6 +17,7 @@ from typing import Protocol
 
 from fiber._agent.interface import OUT_OF_MEMORY, Cause, ChildObserver, ChildSpec, ExitReport
 from fiber._agent.usage import Usage
+from fiber._backends.blobs import BlobSender, Fanout
 from fiber._hub.hub import Hub
 from fiber._logs import OutputWriter
 from fiber._output_files import OutputFile
@@ -26,7 +25,8 @@ from fiber._transport.link import Link
 from fiber._transport.link_protocol import Frame
 from fiber._transport.loop import EventLoop
 from fiber._wire import messages, packet
-from fiber._wire.memory_files import Blob, BytesLike
+from fiber._wire.blob_messages import Holding, Lacking, Unfetched
+from fiber._wire.memory_files import Blob, BytesLike, shared_blob
 from fiber._wire.packet import Message
 
 _SHUTDOWN_GRACE = 0.5
@@ -80,6 +80,7 @@ class RemoteAgent:
         hub: Hub,
         output: OutputWriter,
         observer: AgentObserver,
+        fanout: Fanout | None = None,
     ) -> None:
         self.host = host
         self.loop = loop
@@ -96,7 +97,7 @@ class RemoteAgent:
         self.suspect = False
         """True while the agent is silent for longer than usual."""
         self._link = link
-        self._blobs = BlobSender(loop, self._put)
+        self._blobs = BlobSender(loop, self._put, fanout)
         self._hub = hub
         self._output = output
         self._observer = observer
@@ -113,6 +114,10 @@ class RemoteAgent:
         self._children[number] = child
         child.place(self, number)
         self._blobs.send_missing(child.blobs, child.begin)
+
+    def bring(self, blobs: Iterable[Blob], then: Callable[[], None]) -> None:
+        """Call ``then`` once the agent has these blobs."""
+        self._blobs.send_missing(blobs, then)
 
     def describe_pod(self, pod: str, node: str, *, ending: str, disrupted: bool) -> None:
         """Set the facts of the agent's pod, for the reports of its children."""
@@ -148,6 +153,7 @@ class RemoteAgent:
         if self.leaving or self.lost is not None:
             return
         self.leaving = reason
+        self._blobs.retire()
         self._observer.leaving(self)
         for child in list(self._children.values()):
             child.observer.draining()
@@ -159,6 +165,7 @@ class RemoteAgent:
         self.lost = reason
         self.disrupted = bool(disrupted or self.disrupted or self.leaving)
         self._hub.unlink(self.host, reason)
+        self._blobs.close()
         try:
             self._observer.lost(self, reason)
         finally:  # also after an error, so that no caller waits for these children
@@ -197,8 +204,8 @@ class RemoteAgent:
         if isinstance(message, messages.Leave):
             self.leave(message.reason)
             return
-        if isinstance(message, messages.Lacking):
-            self._blobs.lost(message.digest)
+        if isinstance(message, Lacking | Holding | Unfetched):
+            self._blobs.on_report(message)
             return
         number = getattr(message, "child", None)
         child = None if number is None else self._children.get(number)
@@ -254,6 +261,8 @@ class RemoteChild:
         """Packets to deliver after the Start."""
         self._unasked: list[messages.LinkMessage] | None = []
         """Signals and recalls that wait until the Start has left, so as not to overtake it."""
+        self._held: deque[_HeldPacket] = deque()
+        """Packets to deliver after blobs that some of them need."""
         self._delivered = 0
         self._latest: deque[int] = deque(maxlen=_REMEMBERED)
         self._channel: RemoteTaskChannel | None = None
@@ -319,10 +328,33 @@ class RemoteChild:
         if self._agent is None or self._start is not None:
             self._early.append((seq, payload, buffers))
             return True
+        shared = [(at, blob) for at, one in enumerate(buffers) if (blob := shared_blob(one))]
+        if not shared and not self._held:
+            self._note_delivery(seq)
+            self._agent.transmit(messages.Deliver(self._number, seq, payload, buffers))
+            return True
+        packet_ = _HeldPacket(seq, payload, buffers, shared)
+        self._held.append(packet_)
+        self._agent.bring([blob for _, blob in shared], partial(self._release, packet_))
+        return True
+
+    def _note_delivery(self, seq: int) -> None:
         self._delivered += 1
         self._latest.append(seq)
-        self._agent.transmit(messages.Deliver(self._number, seq, payload, buffers))
-        return True
+
+    def _release(self, released: _HeldPacket) -> None:
+        """Send the packets whose blobs the agent has, in their order."""
+        released.is_ready = True
+        while self._held and self._held[0].is_ready and self._agent is not None:
+            ready = self._held.popleft()
+            self._note_delivery(ready.seq)
+            # The blobs are kept until the message has left, so that no Forget passes it.
+            self._agent.transmit(ready.message(self._number), partial(ready.shared.clear))
+
+    def _take_held(self) -> list[int]:
+        held = [one.seq for one in self._held]
+        self._held.clear()
+        return held
 
     def lease_channel(self) -> RemoteTaskChannel | None:
         """Return the task channel for direct use; None if the child has ended."""
@@ -380,7 +412,7 @@ class RemoteChild:
             self.pid, self._asked = message.pid, None
             self.observer.started(message.pid)
         elif isinstance(message, messages.Recalled):
-            self.observer.recalled(list(message.seqs))
+            self.observer.recalled([*message.seqs, *self._take_held()])
         elif isinstance(message, messages.ShownStack):
             self.observer.showed_stack(message.text)
         elif isinstance(message, messages.Measured):
@@ -409,7 +441,7 @@ class RemoteChild:
         if self._channel is not None:
             self._channel.end()
         missed = list(self._latest)[max(0, len(self._latest) - crossed) :]
-        missed += [seq for seq, _, _ in self._early]
+        missed += [seq for seq, _, _ in self._early] + self._take_held()
         self._early.clear()
         report = report._replace(unread=(*report.unread, *missed))
         if self._agent is not None:
@@ -417,76 +449,31 @@ class RemoteChild:
         self.observer.exited(report)
 
 
-class Send(Protocol):
-    """Function that sends a message, and calls ``on_left`` once the whole message has left."""
+class _HeldPacket:
+    """Packet to a child that waits for the blobs of which it consists, or for earlier packets."""
 
-    def __call__(
-        self, message: messages.LinkMessage, on_left: Callable[[], None] | None = None
-    ) -> None: ...
+    def __init__(
+        self,
+        seq: int,
+        payload: BytesLike,
+        buffers: Sequence[memoryview],
+        shared: list[tuple[int, Blob]],
+    ) -> None:
+        self.seq = seq
+        self.shared = shared
+        """Positions of the buffers that are blobs, and the blobs."""
+        self.is_ready = False
+        self._payload = payload
+        self._buffers = buffers
 
-
-class BlobSender:
-    """Sender of blobs.  It sends each blob once, and Forget when no object refers to the blob.
-
-    So an agent keeps no more blobs than this program does.  A blob lives as long as a pool, a child
-    or the program refers to it.  Runs on the loop thread.
-    """
-
-    def __init__(self, loop: EventLoop, send: Send) -> None:
-        self._loop = loop
-        self._send = send
-        self._sent: dict[bytes, weakref.ref[Blob]] = {}
-        self._leaving: dict[bytes, int] = {}
-        """Number of times that each blob was sent and has not left."""
-        self._waiting: list[tuple[list[bytes], Callable[[], None]]] = []
-        """Blobs that a caller needs, and the function to call when they have left."""
-
-    def send_missing(self, blobs: Iterable[Blob], then: Callable[[], None]) -> None:
-        """Send the blobs that the agent does not have, and call ``then`` when all have left.
-
-        Without this wait a small message could overtake a large blob.
-        """
-        needed = []
-        for blob in blobs:
-            digest = blob.digest
-            needed.append(digest)
-            if digest not in self._sent:
-                self._leaving[digest] = self._leaving.get(digest, 0) + 1
-                self._send(messages.KeepBlob(digest, blob.data), partial(self._left, digest))
-            # The newest of several with the same content counts.
-            self._sent[digest] = weakref.ref(blob, self._forgetter(digest))
-        self._waiting.append((needed, then))
-        self._go_on()
-
-    def lost(self, digest: bytes) -> None:
-        """Note that the agent could not keep a blob."""
-        self._sent.pop(digest, None)
-
-    def _left(self, digest: bytes) -> None:
-        self._leaving[digest] -= 1
-        if not self._leaving[digest]:
-            del self._leaving[digest]
-            self._go_on()
-
-    def _go_on(self) -> None:
-        waiting, self._waiting = self._waiting, []
-        for needed, then in waiting:
-            if self._leaving.keys().isdisjoint(needed):
-                then()
-            else:
-                self._waiting.append((needed, then))
-
-    def _forgetter(self, digest: bytes) -> Callable[[object], None]:
-        # A finalizer runs on any thread, and may only put a call into the loop's queue.
-        return lambda _: self._loop.call_soon(self._forget, digest)
-
-    def _forget(self, digest: bytes) -> None:
-        reference = self._sent.get(digest)
-        if (
-            reference is not None and reference() is None
-        ):  # else the same blob was made and sent again
-            del self._sent[digest]
-            self._send(messages.Forget(digest))
+    def message(self, child: int) -> messages.LinkMessage:
+        """Return the message to the child's agent, which has the blobs."""
+        if not self.shared:
+            return messages.Deliver(child, self.seq, self._payload, self._buffers)
+        positions = {at for at, _ in self.shared}
+        others = [one for at, one in enumerate(self._buffers) if at not in positions]
+        digests = [(at, blob.digest) for at, blob in self.shared]
+        return messages.DeliverShared(child, self.seq, digests, self._payload, others)
 
 
 class RemoteTaskChannel:

@@ -124,7 +124,7 @@ class PoolExecutor:
             on_ready=self._ready,
         )
         self._leases_workers = options.max_tasks is None and not options.retryable
-        self._functions = FunctionCache()
+        self._cache = FunctionCache(runtime.backend.passes_on, options.maximum)
         self.calls = Calls(
             self._loop,
             self._scheduler,
@@ -189,7 +189,7 @@ class PoolExecutor:
         queue: CallQueue | None = None,
     ) -> None:
         """Submit a call.  The calls of a ``queue`` share options; ``timeout`` is for this one."""
-        call = pickle_call(self._functions, future, function, args, kwargs, self.reject)
+        call = pickle_call(self._cache, future, function, args, kwargs, self.reject)
         if call is None:
             return
         self._check()
@@ -207,7 +207,7 @@ class PoolExecutor:
         """Submit a call and wait for it; return its result or raise its exception."""
         direct = timeout is None and self._leases_workers
         call = pickle_call(
-            self._functions, future, function, args, kwargs, self.reject, blocking=direct
+            self._cache, future, function, args, kwargs, self.reject, blocking=direct
         )
         if call is None:
             return future.get()
@@ -233,9 +233,10 @@ class PoolExecutor:
         self, future: TaskFuture, function: Callable[..., Any], args: Sequence[Any]
     ) -> None:
         """Submit a call to every worker, ready or starting; ``future`` gets an outcome of each."""
-        call = pickle_call(self._functions, future, function, args, {}, self.reject)
+        call = pickle_call(self._cache, future, function, args, {}, self.reject)
         if call is not None:
             self._check()
+            self._cache.share(call.buffers)
             self._loop.call_soon(self._broadcast, WorkItem(work.CALLS, future=future), call)
 
     def reject(self, future: TaskFuture, error: BaseException) -> None:
@@ -245,7 +246,7 @@ class PoolExecutor:
 
     def function(self, function: Callable[..., Any]) -> Function:
         """Return ``function``, pickled.  Equal pickles are the same Function."""
-        return self._functions.get(function)
+        return self._cache.get(function)
 
     def submit(self, item: WorkItem, tasks: Sequence[Any]) -> None:
         """Run all of ``tasks``.  The sequence must not change until they are done."""

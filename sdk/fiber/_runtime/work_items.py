@@ -17,12 +17,14 @@ from typing import Any, Protocol
 from fiber import reduction
 from fiber._agent.by_value import FUNCTIONS
 from fiber._engine.chunks import TaskPace
+from fiber._engine.fanout import COPIES, WORTH
 from fiber._engine.tasks import Job, Limits
 from fiber._hub.handles import GrantSet
 from fiber._runtime.by_value import FunctionPickles
 from fiber._runtime.threads import check_may_wait
 from fiber._transport.loop import DOZE
 from fiber._wire import packet, work
+from fiber._wire.memory_files import share
 
 FUNCTION_SIZE = 1 << 16
 """Largest pickle, in bytes, that a FunctionCache keeps."""
@@ -60,9 +62,14 @@ def name_of(function: Any) -> str:
 
 
 class FunctionCache:
-    """Recognizes functions by their pickles.  Runs on any thread."""
+    """Recognizes functions by their pickles.  Runs on any thread.
 
-    def __init__(self) -> None:
+    ``passes_on``: agents pass blobs on to each other.  Then large buffers become blobs, if there
+    are so many ``workers`` that it pays.
+    """
+
+    def __init__(self, passes_on: bool, workers: int) -> None:
+        self._shares = passes_on and workers > COPIES
         self.light = FunctionPickles().light
         """Return what to pickle in place of a function."""
         self._known: dict[bytes, Function] = {}
@@ -79,12 +86,19 @@ class FunctionCache:
         if known is not None:
             return known
         sent = work.move_beside((data, buffers))
+        self.share(sent[1])
         made = Function(next(self._ids), name_of(function), *sent, grants)
         if not buffers and grants is None and len(data) <= FUNCTION_SIZE:
             if len(self._known) >= FUNCTIONS:
                 self._known.clear()  # in one step, as several threads may call this
             self._known[data] = made
         return made
+
+    def share(self, buffers: Sequence[memoryview]) -> None:
+        """Make blobs of large buffers that go to many workers."""
+        for buffer in buffers if self._shares else ():
+            if buffer.nbytes >= WORTH:
+                share(buffer)
 
 
 class InputStream:

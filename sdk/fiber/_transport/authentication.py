@@ -53,7 +53,8 @@ from fiber._transport.credentials import (
     MasterCredentials,
     ProvenMaster,
 )
-from fiber._wire.messages import PROTOCOL, ProtocolError
+from fiber._wire.messages import ProtocolError
+from fiber._wire.packet_layout import PROTOCOL
 from fiber.errors import AuthenticationError, ConfigError, VersionMismatch
 
 _HELLO, _WELCOME, _REFUSAL = 0x10, 0x11, 0x12

@@ -101,6 +101,8 @@ class AgentDialer:
         self._obstacle = "no attempt was made"
         self.lost_grace: float | None = None
         """Seconds to wait for another master if this one is lost, once there is a link."""
+        self.local_host = ""
+        """Address of this host on the way to the master; empty if there is none."""
         self._over = threading.Event()
         self._lock = threading.Lock()
         self._sock: socket.socket | None = None
@@ -163,6 +165,8 @@ class AgentDialer:
         Return the answer, the master, and the connection without TLS.
         """
         sock = self._connect(self._address)
+        if sock.family in (socket.AF_INET, socket.AF_INET6):
+            self.local_host = sock.getsockname()[0]
         tls_handshake = authentication.AgentHandshake(sock, self._context)
         try:
             with self._lock:

@@ -23,6 +23,7 @@ import mmap
 import os
 import sys
 import threading
+import weakref
 from collections import deque
 from collections.abc import Iterable
 from ctypes import pythonapi
@@ -370,6 +371,26 @@ class Blob:
             _write_all(file.fileno(), self.data)
             self._file = file
         return self._file.fileno()
+
+
+_shared: dict[int, tuple[weakref.ref[memoryview], Blob]] = {}
+"""Blobs of buffers that many packets have, by the ids of the buffers."""
+
+
+def share(buffer: memoryview) -> None:
+    """Make a blob of a buffer, for as long as the buffer exists.  Any thread.
+
+    Packets to other hosts then name the blob.  The bytes must not change.
+    """
+    key = id(buffer)
+    gone = weakref.ref(buffer, lambda _: _shared.pop(key, None))
+    _shared[key] = gone, Blob(buffer.cast("B"))  # a new view: the blob must not keep this one
+
+
+def shared_blob(buffer: memoryview) -> Blob | None:
+    """Return the blob of a buffer that is shared."""
+    found = _shared.get(id(buffer))
+    return found[1] if found is not None and found[0]() is buffer else None
 
 
 def _write_all(fd: int, data: BytesLike) -> None:

@@ -14,16 +14,11 @@ import struct
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
+from fiber._wire import blob_messages
+from fiber._wire.blob_messages import BlobMessage, KeepBlob
 from fiber._wire.memory_files import BytesLike
-from fiber._wire.packet_layout import pieces_of, read_packet, redacted
+from fiber._wire.packet_layout import PROTOCOL, pieces_of, read_packet, redacted
 from fiber.errors import FiberError
-
-PROTOCOL = 5
-"""Version of the frames of this module and of all that they carry: the messages of ``work.py`` and
-``hub.protocol``, and pickles of Fiber's classes.  Raise it when one of these changes."""
-
-DIGEST_BYTES = 32
-"""Length of a blob's name, the SHA-256 of its bytes."""
 
 
 class ProtocolError(FiberError):
@@ -48,44 +43,6 @@ class Start(NamedTuple):
 
     def __repr__(self) -> str:
         return redacted(self)
-
-
-class KeepBlob(NamedTuple):
-    """Master to agent: keep this blob; Start frames name it by its digest until a Forget."""
-
-    digest: bytes
-    data: BytesLike
-
-    def encode(self) -> bytes:
-        """Return the frame."""
-        return b"".join(self.pieces())
-
-    def pieces(self) -> Sequence[BytesLike]:
-        """Return the frame in pieces.  The data is not copied."""
-        return _BLOB_HEAD.pack(PROTOCOL, _BLOB, self.digest), self.data
-
-    def __repr__(self) -> str:
-        return redacted(self)
-
-
-class Forget(NamedTuple):
-    """Master to agent: no later Start names this blob, unless it is sent again."""
-
-    digest: bytes
-
-    def encode(self) -> bytes:
-        """Return the frame."""
-        return _BLOB_HEAD.pack(PROTOCOL, _FORGET, self.digest)
-
-
-class Lacking(NamedTuple):
-    """Agent to master: this blob is missing here; send it again before a child needs it."""
-
-    digest: bytes
-
-    def encode(self) -> bytes:
-        """Return the frame."""
-        return _BLOB_HEAD.pack(PROTOCOL, _LACKING, self.digest)
 
 
 class Started(NamedTuple):
@@ -125,6 +82,32 @@ class Deliver(NamedTuple):
     def pieces(self) -> Sequence[BytesLike]:
         """Return the frame in pieces.  The buffers and a large payload are not copied."""
         head = _DELIVERY.pack(PROTOCOL, _DELIVER, self.child, self.seq)
+        return pieces_of(head, self.payload, self.buffers)
+
+    def __repr__(self) -> str:
+        return redacted(self)
+
+
+class DeliverShared(NamedTuple):
+    """Master to agent: a packet some of whose buffers are blobs that the agent has."""
+
+    child: int
+    seq: int
+    shared: Sequence[tuple[int, bytes]]
+    """Positions and digests of these buffers, in the order of the positions."""
+    payload: BytesLike
+    buffers: Sequence[BytesLike] = ()
+    """The other buffers."""
+
+    def encode(self) -> bytes:
+        """Return the frame."""
+        return b"".join(self.pieces())
+
+    def pieces(self) -> Sequence[BytesLike]:
+        """Return the frame in pieces.  The buffers and a large payload are not copied."""
+        head = _DELIVERY.pack(PROTOCOL, _DELIVER_SHARED, self.child, self.seq)
+        head += _COUNT.pack(len(self.shared))
+        head += b"".join([_SHARED_BUFFER.pack(*one) for one in self.shared])
         return pieces_of(head, self.payload, self.buffers)
 
     def __repr__(self) -> str:
@@ -331,13 +314,12 @@ class Leave(NamedTuple):
 
 
 LinkMessage: TypeAlias = (
-    Start
-    | KeepBlob
-    | Forget
-    | Lacking
+    BlobMessage
+    | Start
     | Started
     | Signal
     | Deliver
+    | DeliverShared
     | FromChild
     | Recall
     | Recalled
@@ -358,7 +340,7 @@ LinkMessage: TypeAlias = (
 HubMessage: TypeAlias = TunnelOpen | TunnelData | TunnelClose | MemoryMessage
 """Message between the hubs of both sides."""
 
-ChildRequest: TypeAlias = Deliver | Signal | Recall | Measure
+ChildRequest: TypeAlias = Deliver | DeliverShared | Signal | Recall | Measure
 """Message that asks something of a child."""
 
 
@@ -389,20 +371,23 @@ def decode(frame: BytesLike) -> LinkMessage:
 
 _START, _STARTED, _SIGNAL, _DELIVER, _FROM_CHILD, _RECALL, _RECALLED, _EXITED = range(1, 9)
 _OUTPUT, _TUNNEL_OPEN, _TUNNEL_DATA, _TUNNEL_CLOSE, _SHUTDOWN = 9, 11, 12, 13, 14
-_BLOB, _FORGET, _LACKING, _MEMORY, _LEAVE, _STACK, _MEASURE, _MEASURED = range(15, 23)
+_MEMORY, _LEAVE, _STACK, _MEASURE, _MEASURED = range(18, 23)
+
+_DELIVER_SHARED = 28
 
 _HEAD = struct.Struct("<BB")
 _NUMBER = struct.Struct("<BBQ")
 _NUMBERS = struct.Struct("<BBQq")
 _DELIVERY = struct.Struct("<BBQQ")
+_COUNT = struct.Struct("<I")
+_SHARED_BUFFER = struct.Struct(f"<I{blob_messages.DIGEST_BYTES}s")
 _USAGE = struct.Struct("<BBQQQ")
 _GRACE = struct.Struct("<BBd")
-_BLOB_HEAD = struct.Struct(f"<BB{DIGEST_BYTES}s")
 
 
 def pieces(message: LinkMessage) -> Sequence[BytesLike]:
     """Return a message's frame.  Large parts are separate pieces, which are not copied."""
-    if isinstance(message, Start | KeepBlob | Deliver | FromChild | TunnelData):
+    if isinstance(message, Start | KeepBlob | Deliver | DeliverShared | FromChild | TunnelData):
         return message.pieces()
     return (message.encode(),)
 
@@ -415,10 +400,13 @@ def lane(message: LinkMessage) -> Hashable:
     """
     if isinstance(message, TunnelData | TunnelClose):
         return (_TUNNEL_DATA, message.tunnel)
-    if isinstance(message, Start | Deliver | FromChild | Recall | Recalled | Exited | ChildOutput):
+    if isinstance(
+        message,
+        Start | Deliver | DeliverShared | FromChild | Recall | Recalled | Exited | ChildOutput,
+    ):
         return (_DELIVER, message.child)
-    if isinstance(message, KeepBlob | Forget):
-        return (_BLOB, message.digest)
+    if isinstance(message, BlobMessage):
+        return (blob_messages.KEEP, message.digest)
     return None
 
 
@@ -447,18 +435,6 @@ def _read_start(view: memoryview) -> Start:
     return Start(_NUMBER.unpack_from(view)[2], spec, process)
 
 
-def _read_blob(view: memoryview) -> KeepBlob:
-    return KeepBlob(_BLOB_HEAD.unpack_from(view)[2], view[_BLOB_HEAD.size :])
-
-
-def _read_forget(view: memoryview) -> Forget:
-    return Forget(_BLOB_HEAD.unpack(view)[2])
-
-
-def _read_lacking(view: memoryview) -> Lacking:
-    return Lacking(_BLOB_HEAD.unpack(view)[2])
-
-
 def _read_started(view: memoryview) -> Started:
     _, _, child, pid = _NUMBERS.unpack(view)
     return Started(child, pid)
@@ -472,6 +448,15 @@ def _read_signal(view: memoryview) -> Signal:
 def _read_deliver(view: memoryview) -> Deliver:
     _, _, child, seq = _DELIVERY.unpack_from(view)
     return Deliver(child, seq, *read_packet(view, _DELIVERY.size))
+
+
+def _read_deliver_shared(view: memoryview) -> DeliverShared:
+    _, _, child, seq = _DELIVERY.unpack_from(view)
+    (count,) = _COUNT.unpack_from(view, _DELIVERY.size)
+    start = _DELIVERY.size + _COUNT.size
+    end = start + count * _SHARED_BUFFER.size
+    shared = tuple(_SHARED_BUFFER.iter_unpack(view[start:end]))
+    return DeliverShared(child, seq, shared, *read_packet(view, end))
 
 
 def _read_from_child(view: memoryview) -> FromChild:
@@ -566,13 +551,12 @@ def _string(value: Any) -> str:
 
 
 _READERS: dict[int, Callable[[memoryview], LinkMessage]] = {
+    **blob_messages.READERS,
     _START: _read_start,
-    _BLOB: _read_blob,
-    _FORGET: _read_forget,
-    _LACKING: _read_lacking,
     _STARTED: _read_started,
     _SIGNAL: _read_signal,
     _DELIVER: _read_deliver,
+    _DELIVER_SHARED: _read_deliver_shared,
     _FROM_CHILD: _read_from_child,
     _RECALL: _read_recall,
     _RECALLED: _read_recalled,

@@ -13,6 +13,11 @@ from typing import Any
 from fiber._wire.memory_files import BytesLike
 from fiber._wire.packet import ALIGNMENT, INLINE_LIMIT
 
+PROTOCOL = 6
+"""Version of the frames between master and agent, and of all that they carry: the messages of
+``work.py`` and ``hub.protocol``, and pickles of Fiber's classes.  Raise it when one of these
+changes."""
+
 _PACKET = struct.Struct("<IQ")
 _PADDING = bytes(ALIGNMENT)
 

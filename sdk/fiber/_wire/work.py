@@ -25,7 +25,7 @@ The worker gives the other tasks back.
 which the pool runs the task again.  A large pickle is the first of its buffers, and None here.
 ``error`` is such a pickle.
 
-A change of this format raises ``messages.PROTOCOL``.
+A change of this format raises ``packet_layout.PROTOCOL``.
 """
 
 from __future__ import annotations

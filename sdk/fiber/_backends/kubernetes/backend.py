@@ -18,6 +18,7 @@ from typing import Any
 from fiber import _worker_images
 from fiber._agent.interface import ChildObserver, ChildSpec
 from fiber._backends.agent_set import AgentSet
+from fiber._backends.blobs import Fanout
 from fiber._backends.kubernetes.api import Api
 from fiber._backends.kubernetes.attached_pool import LOST, AttachedPool
 from fiber._backends.kubernetes.fiber_pool import FiberPoolClient
@@ -60,6 +61,11 @@ class KubernetesBackend:
         """``Pods`` by their shape or pool name, and by the number of earlier ones for the same."""
         self._closing = False
         _worker_images.use(True)
+
+    @property
+    def passes_on(self) -> bool:
+        """True if agents pass large blobs on to each other."""
+        return self._config.pass_on != "never"
 
     def child(self, spec: ChildSpec, observer: ChildObserver) -> RemoteChild:
         """Return a child, not started yet, for a pod that has the resources it asks for."""
@@ -152,7 +158,13 @@ class Pods:
             self._placement, maximum=config.max_pods, idle_timeout=config.idle_timeout
         )
         self.agents = AgentSet(
-            loop, hub, output, self._placement, on_change=self._changed, on_lost=self._lost
+            loop,
+            hub,
+            output,
+            self._placement,
+            fanout=None if config.pass_on == "never" else Fanout(names.PEER_PORT),
+            on_change=self._changed,
+            on_lost=self._lost,
         )
         self._waiting = WaitingChildren(
             self.agents,
