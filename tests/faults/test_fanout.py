@@ -29,6 +29,7 @@ from fiber._agent.blobs import BlobFetch, BlobSource, BlobStore
 from fiber._backends import loopback
 from fiber._backends.blobs import BlobSender, Fanout
 from fiber._backends.loopback import LoopbackBackend
+from fiber._transport import link
 from fiber._transport.listener import MasterListener
 from fiber._transport.loop import Loop
 from fiber._wire import messages
@@ -216,6 +217,9 @@ def loop() -> Iterator[Loop]:
     made = Loop()
     made.start_thread("test-loop")
     yield made
+    ended = threading.Event()
+    made.call_later(2 * link._LAST_WORD, ended.set)  # links close their connections a little later
+    assert ended.wait(PATIENCE)
     made.stop()
 
 
@@ -325,9 +329,9 @@ class Liar:
         )
         self.address = self._listener.address
 
-    def _joined(self, link: Any) -> None:
-        self._link = link
-        link.attach(self)
+    def _joined(self, joined: Any) -> None:
+        self._link = joined
+        joined.attach(self)
 
     def on_frame(self, frame: Any) -> None:
         assert isinstance(messages.decode(frame), Want)
