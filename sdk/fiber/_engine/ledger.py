@@ -240,8 +240,7 @@ class Ledger:
     def demand(self) -> int:
         """Return how many chunks run or wait for a worker, without those that a pause holds back.
 
-        The tasks of a chunk travel together, so it is work for one worker. A cancelled batch that a
-        worker still has counts as one.
+        A chunk is work for one worker. A cancelled batch that a worker still has counts as a chunk.
         """
         held_back = sum([job.held_back_chunks for job in self._paused]) if self._paused else 0
         return self._open_chunks - held_back + len(self._cancelled)
@@ -453,10 +452,8 @@ class Ledger:
     def retry(self, receipt: Receipt, index: int) -> bool:
         """Run a task again because of its result; return False if it has no tries left."""
         job = receipt.job
-        if job not in self.jobs and not job.finished:
-            return False  # cancelled
-        if not job.charges.charge(index):
-            return False
+        if (job not in self.jobs and not job.finished) or not job.charges.charge(index):
+            return False  # it is cancelled, or has no tries left
         if job not in self.jobs:  # the job was finished by this task
             self.jobs.add(job)
             self._open_chunks += job.open_chunks

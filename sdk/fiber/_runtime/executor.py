@@ -206,9 +206,7 @@ class PoolExecutor:
     ) -> Any:
         """Submit a call and wait for it; return its result or raise its exception."""
         direct = timeout is None and self._leases_workers
-        call = pickle_call(
-            self._cache, future, function, args, kwargs, self.reject, blocking=direct
-        )
+        call = pickle_call(self._cache, future, function, args, kwargs, self.reject, direct)
         if call is None:
             return future.get()
         self._check()

@@ -369,7 +369,6 @@ def pickle_call(
     args: Iterable[Any],
     kwargs: Mapping[str, Any],
     reject: Callable[[TaskFuture, BaseException], None],
-    *,
     blocking: bool = False,
 ) -> Call | None:
     """Pickle a call; if that fails, pass the error to ``reject`` and return None."""
