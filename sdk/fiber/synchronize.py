@@ -336,10 +336,10 @@ class Barrier(threading.Barrier):
 
     def _join(self) -> None:
         if self._member != os.getpid():  # a forked process is another member
-            self._member = os.getpid()
             self._membership = self._members.enter()
             # A process that ends normally breaks no barrier.
             weakref.finalize(self, self._members.dismiss, self._membership)
+            self._member = os.getpid()  # last: a thread in ``_meet`` looks without the lock
 
     def _change_count(self, by: int) -> None:
         self._members.tally(self._membership, by)

@@ -40,9 +40,9 @@ class Program:
     clone: str
     """Name of its folder among the clones."""
     way: str
-    """How the program gets Fiber."""
+    """Way in which the program gets Fiber."""
     ran: str
-    """What ran, in a few words."""
+    """Description of what ran, in a few words."""
     run: Callable[[Run], dict[str, Value]]
     """Runs the program once, and returns the values to compare."""
     files: tuple[str, ...] = ()

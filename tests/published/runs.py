@@ -1,4 +1,4 @@
-"""One run of a published program: the module that it gets its processes from, and its clone."""
+"""Run of a published program: the module that it gets its processes from, and its clone."""
 
 from __future__ import annotations
 

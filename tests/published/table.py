@@ -13,7 +13,7 @@ BEGIN, END = "<!-- table: make published -->", "<!-- end of table -->"
 NOT_RUN = "not run"
 
 Results = dict[str, Any]
-"""By the program's name: its commit, its changed lines, and the result on each backend."""
+"""Cells by the program's name: its commit, its changed lines, and the result on each backend."""
 
 
 def read(path: Path) -> Results:

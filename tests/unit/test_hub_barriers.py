@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import sys
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from queue import SimpleQueue
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
@@ -71,9 +72,13 @@ def test_each_gets_another_number_in_each_pass(far: Far) -> None:
     assert (barrier.n_waiting, barrier.broken) == (0, False)
 
 
-def test_a_pass_takes_one_request_of_each(far: Far, wires: tuple[Wire, Wire]) -> None:
+def test_a_pass_takes_one_request_of_each(
+    far: Far, wires: tuple[Wire, Wire], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # One that waits for long, or comes before a thread of this host has left, takes more.
+    monkeypatch.setattr(synchronize, "RECHECK", PATIENCE)
     up, _ = wires
-    with parties(far, fiber.Barrier(4), 1, 3) as threads:
+    with parties(far, fiber.Barrier(3), 0, 3) as threads:
         for _ in range(3):  # until each has a stream, and the process a place
             meet(threads)
         before = up.frames
@@ -106,6 +111,23 @@ def noting(event: threading.Event, function: Any) -> Any:
         return function(*arguments)
 
     return noted
+
+
+def test_threads_that_come_while_the_process_becomes_a_member_take_the_steps(
+    far: Far, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    barrier = fiber.Barrier(2)
+    other: Any = far(barrier)
+    enter, met = other._members.enter, []
+
+    def look_meanwhile() -> Any:
+        met.append(other._meet(time.monotonic() + PATIENCE))
+        return enter()
+
+    monkeypatch.setattr(other._members, "enter", look_meanwhile)
+    with parties(cast("Far", lambda _: other), barrier, 1, 1) as threads:
+        assert meet(threads) == [0, 1]
+        assert met == [None]
 
 
 def test_a_timeout_breaks_it_for_all_until_it_is_reset(far: Far) -> None:

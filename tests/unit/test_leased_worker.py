@@ -1,4 +1,4 @@
-"""What a leased worker did, as its caller counts it and the loop notes it."""
+"""Work of a leased worker, as its caller counts it and the loop notes it."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ class FunctionPickles:
     """Pickles of functions that travel by value.  Runs on any thread."""
 
     def __init__(self) -> None:
-        self._known: dict[FunctionType, _Known] = {}
+        self._known: dict[FunctionType, _KnownFunction] = {}
 
     def light(self, function: Callable[..., Any]) -> Any:
         """Return what to pickle in place of ``function``: itself, or its pickle."""
@@ -50,7 +50,7 @@ class FunctionPickles:
         pickled = FunctionByValue(data)
         if len(self._known) >= FUNCTIONS:
             self._known.clear()  # in one step, as several threads may call this
-        self._known[function] = _Known(reads, pickled)
+        self._known[function] = _KnownFunction(reads, pickled)
         return pickled
 
 
@@ -61,7 +61,7 @@ def _goes_by_value(function: FunctionType) -> bool:
     )
 
 
-class _Known(NamedTuple):
+class _KnownFunction(NamedTuple):
     reads: _Reads
     pickled: FunctionByValue
 
