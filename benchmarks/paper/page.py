@@ -81,8 +81,9 @@ def _evolution(run: Run) -> str:
         ]
         for case in cases
     ]
+    iterations = cases[0].params["iterations"]
     note = (
-        f"{cases[0].params['iterations']} iterations of {cases[0].params['population']:,} "
+        f"{iterations} iteration{'s' * (iterations != 1)} of {cases[0].params['population']:,} "
         "episodes. In parentheses: the bound divided by the time (1 is the best possible)."
     )
     return _text(run, report.table(head, rows), note)
@@ -148,7 +149,9 @@ def _times(run: Run, case: Case, name: str, other: str) -> str:
 def _text(run: Run, table: str, note: str = "") -> str:
     shares = ", ".join(f"{100 * share:.0f} %" for share in run.in_use)
     sentences = [
-        f"Median of at most {run.about['rounds']} rounds.",
+        "One round."
+        if run.about["rounds"] == 1
+        else f"Median of at most {run.about['rounds']} rounds.",
         note,
         f"Before the rounds, other programs used {shares} of the processors' time."
         if shares

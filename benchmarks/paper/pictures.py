@@ -68,12 +68,13 @@ def _evolution(panel: Any, run: Run) -> None:
     cases = evolution.cases(run.about["size"])
     points = [(float(case.params["workers"]), case.name) for case in cases]
     bounds = [evolution.bound(**case.params) for case in cases]
+    iterations = cases[0].params["iterations"]
     figures.lines(panel, run, points, evolution.TIME)
     panel.plot([x for x, _ in points], bounds, color=_GREY, linestyle="--", label="bound")
     panel.set(
         title="Evolution strategies",
         xlabel="workers (✗: did not finish)",
-        ylabel=f"time of {cases[0].params['iterations']} iterations",
+        ylabel=f"time of {iterations} iteration{'s' * (iterations != 1)}",
         yscale="log",
         xticks=[x for x, _ in points],
     )

@@ -14,6 +14,8 @@ PARAMETERS = 2 * (SIGHT + 4)  # of a policy: for each of two actions a weight of
 HARDEST = (9.0, 3.0, 0.8)
 NOISES, UPDATES, SIGMA, RATE = 12, 3, 0.1, 0.15  # of evolution strategies
 
+pairs: Any = None  # the manager's dict of all pairs, in a worker
+
 
 class Course(NamedTuple):
     """Course with gaps, walls and rough ground, of at most these sizes."""
@@ -62,9 +64,6 @@ def play(course: Course, policies: Array) -> Array:
         y = np.maximum(y + upward, ground[x.astype(int)])
         running &= (y > -2) & (x < LENGTH)
     return 100 * x / LENGTH
-
-
-pairs: Any = None
 
 
 def share(managed: Any) -> None:

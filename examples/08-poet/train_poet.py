@@ -80,8 +80,10 @@ def draw(path: Path, history: list[tuple[dict[int, float], int]]) -> None:
     figure = Figure(figsize=(8.6, 5.4), dpi=150, layout="constrained")
     lives, sizes = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
     image = lives.imshow(scores, aspect="auto", origin="lower", interpolation="none")
-    figure.colorbar(image, ax=lives, label="crossed by each pair, percent")
+    figure.colorbar(image, ax=lives, label="crossed, percent of the course")
+    lives.set(title="Score of each pair", ylabel="pair, oldest below")
     sizes.plot([(len(pairs), workers) for pairs, workers in history], drawstyle="steps-mid")
+    sizes.set(xlabel="iterations before", ylabel="number")
     sizes.legend(["pairs", "workers"], frameon=False)
     figure.savefig(path)
 

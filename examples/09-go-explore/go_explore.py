@@ -47,7 +47,7 @@ def phase_1(options: argparse.Namespace) -> tuple[dict[Any, int], Way]:
                     if reward == TREASURE and not 0 < len(treasure) <= len(way):
                         treasure = way
             if number % 10 == 0:
-                print(f"round {number}: {len(archive)} cells, treasure in {len(treasure)} moves")
+                print(f"round {number}: {len(archive)} cells, a way of {len(treasure)} moves")
     return found_in, treasure
 
 
@@ -63,7 +63,7 @@ def draw(path: Path, found_in: dict[Any, int], curves: list[list[float]]) -> Non
     """Draw when each cell was found, and how often the policies succeeded while they learned."""
     figure = Figure(figsize=(10, 3.6), dpi=150, layout="constrained")
     vault, success = figure.subplots(1, 2, width_ratios=(1.8, 1))
-    vault.imshow([[tile in "#^" for tile in row] for row in MAP], cmap="Greys", alpha=0.4)
+    vault.imshow([["^#".find(tile) for tile in row] for row in MAP], cmap="Greys", alpha=0.4)
     x, y, keys = map(np.array, zip(*found_in, strict=True))
     dots = vault.scatter(2 * x + 0.3 + 0.6 * keys, 2 * y + 0.5, c=[*found_in.values()], s=14)
     figure.colorbar(dots, ax=vault, label="found in round", shrink=0.7)

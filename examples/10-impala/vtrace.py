@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
-HIDDEN, DISCOUNT, RATE, ENTROPY, CRITIC = 64, 0.99, 3e-3, 0.01, 0.5
+HIDDEN, DISCOUNT, RATE, ENTROPY, CRITIC, SCALE = 64, 0.99, 1e-3, 0.01, 0.5, 0.05
 
 
 class Unroll(NamedTuple):
@@ -61,14 +61,14 @@ class Learner:
         self._moments = [np.zeros((2, *each.shape)) for each in weights]
 
     def learn(self, unrolls: list[Unroll]) -> None:
-        """Improve the weights by a batch of unrolls."""
+        """Improve the weights. Rewards are scaled: large values would drown the policy."""
         seen, actions, before, rewards, over = (
             np.stack([unroll[field] for unroll in unrolls], axis=1) for field in range(3, 8)
         )
         hidden, chances, values = forward(self.weights, seen)
         taken = np.eye(chances.shape[-1])[actions]
         now = (chances[:-1] * taken).sum(-1)
-        targets, advantages = v_trace(values, now / before, rewards, over)
+        targets, advantages = v_trace(values, now / before, SCALE * rewards, over)
         advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
         surprise = np.log(chances[:-1] + 1e-8)
         surprise -= (chances[:-1] * surprise).sum(-1, keepdims=True)

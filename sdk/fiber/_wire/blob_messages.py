@@ -1,7 +1,7 @@
 """Frames about blobs: between the master and an agent, and between two agents.
 
 ``Want`` and its answer, a ``KeepBlob``, travel between agents.  All others travel between the
-master and an agent.  See ``fiber._backends.fanout`` for who serves whom.
+master and an agent.  See ``fiber._engine.fanout`` for who serves whom.
 """
 
 from __future__ import annotations
