@@ -74,7 +74,7 @@ class OutputFile:
     def __init__(self, folder: str, program: str, child: str) -> None:
         self._start = os.path.join(folder, stem_of(program, child))
         self._path = ""
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()  # a signal handler may print meanwhile
         self.left_out = 0
         """Lines that were dropped since the last write."""
 

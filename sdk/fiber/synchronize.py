@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar, cast
 
 from fiber._hub import shared_blocks
 from fiber._hub.local import LocalCounter
-from fiber._hub.shared_blocks import RemoteSemaphore, RemoteWaitList
 from fiber._sync.semaphore import COUNTING, RECURSIVE, SEM_VALUE_MAX, Abandoned
 
 if TYPE_CHECKING:
@@ -278,10 +277,11 @@ class Barrier(threading.Barrier):
     ) -> None:
         self._parties, self._action, self._timeout = parties, action, timeout
         self._cond = condition
-        # Processes that took part, with the number of their waiting threads.
+        # Processes that took part, and their counted threads.  The lock guards both.
         self._members: Any = members
         self._membership: Any = None
         self._member = 0
+        self._counted = 0
 
     def __reduce__(self) -> tuple[Any, ...]:
         parts = self._parties, self._action, self._timeout, self._cond, self._members
@@ -289,27 +289,6 @@ class Barrier(threading.Barrier):
 
     def wait(self, timeout: float | None = None) -> int:
         """Wait for the others; return a different number from 0 to ``parties`` - 1 to each."""
-        timeout = self._timeout if timeout is None else timeout
-        deadline = math.inf if timeout is None else time.monotonic() + timeout
-        index = self._meet(deadline)
-        return self._wait_by_steps(timeout, deadline) if index is None else index
-
-    def _meet(self, deadline: float) -> int | None:
-        """Let the hub of another host wait for this thread; None if it did not."""
-        lock, waiters = self._cond._lock._semlock, self._cond._waiters
-        if not isinstance(waiters, RemoteWaitList) or self._member != os.getpid():
-            return None
-        left = max(0.0, min(deadline - time.monotonic(), RECHECK))
-        return waiters.meet(
-            cast(RemoteSemaphore, lock),
-            self._members,
-            self._membership,
-            self._parties,
-            self._action is not None,
-            left,
-        )
-
-    def _wait_by_steps(self, timeout: float | None, deadline: float) -> int:
         with self._cond as acquired:
             if isinstance(acquired, Abandoned):  # its process died in this method
                 self._bury()
@@ -322,7 +301,7 @@ class Barrier(threading.Barrier):
                 if index + 1 == self._parties:
                     self._release()
                 else:
-                    self._wait(timeout, deadline)
+                    self._wait(self._timeout if timeout is None else timeout)
             finally:
                 self._change_count(-1)
                 self._exit()
@@ -336,13 +315,14 @@ class Barrier(threading.Barrier):
 
     def _join(self) -> None:
         if self._member != os.getpid():  # a forked process is another member
+            self._member, self._counted = os.getpid(), 0
             self._membership = self._members.enter()
             # A process that ends normally breaks no barrier.
             weakref.finalize(self, self._members.dismiss, self._membership)
-            self._member = os.getpid()  # last: a thread in ``_meet`` looks without the lock
 
     def _change_count(self, by: int) -> None:
-        self._members.tally(self._membership, by)
+        self._counted += by
+        self._members.tally(self._membership, self._counted, self._count + by)
 
     def _enter(self) -> None:
         while self._state in (_RESETTING, _DRAINING):
@@ -351,7 +331,8 @@ class Barrier(threading.Barrier):
         if self._state < 0:
             raise threading.BrokenBarrierError
 
-    def _wait(self, timeout: float | None, deadline: float) -> None:
+    def _wait(self, timeout: float | None) -> None:
+        deadline = math.inf if timeout is None else time.monotonic() + timeout
         while self._state == _FILLING:
             left = max(0.0, deadline - time.monotonic())
             if self._cond.wait(min(left, RECHECK)):

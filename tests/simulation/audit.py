@@ -294,16 +294,11 @@ class Audit:
         self._check_idle()
 
     def _check_demand(self, places: dict[Job, list[tuple[str, int, int]]]) -> None:
-        tasks = {
-            job: sum(
-                max(0, min(size, job.reached - first))
-                if job.paused and place == "waiting"
-                else size
-                for place, first, size in where
-            )
+        wanted = sum(
+            max(0, min(size, job.reached - first)) if job.paused and place == "waiting" else size
             for job, where in places.items()
-        }
-        wanted = sum(-(-count // job.unit) for job, count in tasks.items())
+            for place, first, size in where
+        )
         # A worker that runs a cancelled task takes no other.
         unwanted = sum(
             len(batch.items) - batch.received
@@ -312,7 +307,7 @@ class Audit:
         )
         demand = self._ledger.demand()
         fits = wanted <= demand <= wanted + unwanted
-        require(fits, f"the demand is {demand} for {wanted} chunks and {unwanted} cancelled tasks")
+        require(fits, f"the demand is {demand} for {wanted} tasks and {unwanted} cancelled ones")
 
     def _check_workers(self) -> None:
         held = 0
@@ -371,7 +366,7 @@ class Audit:
         """Check the ledger once no event is left."""
         ledger = self._ledger
         require(not ledger.batches, f"batches {list(ledger.batches)} are left over")
-        require(not ledger.demand(), f"{ledger.demand()} chunks are left over")
+        require(not ledger.demand(), f"{ledger.demand()} tasks are left over")
         require(not any(job.closed for job in ledger.jobs), "a finished job is left over")
         require(not any(worker.queue for worker in ledger.workers), "a worker is left busy")
         require(ledger.starting == 0, f"{ledger.starting} workers never started")

@@ -212,14 +212,13 @@ class PoolAudit:
         if self._scheduler.terminated or workers.error is not None or workers.starting:
             return False
         # A caller does not fetch results that wait until earlier ones are read.
-        chunks = sum(
-            -(-((job.reached if job.paused else job.fed) - job.done) // job.unit)
-            for job in self._ledger.jobs
+        tasks = sum(
+            (job.reached if job.paused else job.fed) - job.done for job in self._ledger.jobs
         )
         # A worker that still runs a cancelled task is not free for others.
         held_up = [it for it in self._ledger.workers if it.queue and not it.leaving]
         lost = sum(worker.queue[0].job is None for worker in held_up)
-        wanted = max(chunks and chunks + lost, 0 if self._scheduler.closing else workers.minimum)
+        wanted = max(tasks and tasks + lost, 0 if self._scheduler.closing else workers.minimum)
         return workers.size < min(wanted, workers.maximum)
 
     # Streams

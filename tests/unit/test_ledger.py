@@ -397,18 +397,3 @@ def test_retry_of_a_cancelled_job_is_refused() -> None:
     assert receipt is not None
     ledger.cancel(job)
     assert not ledger.retry(receipt, 0)
-
-
-def test_the_demand_counts_chunks() -> None:
-    """A chunk of tasks of any size is work for one worker."""
-    ledger, _ = ledger_with(1)
-    job = ledger.open(unit=24)
-    ledger.feed(job, list(range(24)))
-    assert ledger.demand() == 1
-    ledger.feed(job, list(range(30)))
-    assert ledger.demand() == 3
-    for batch in assign_all(ledger):
-        ledger.receive(batch.worker, batch.seq, 0, 24, 0.0)
-    assert ledger.demand() == 1
-    ledger.cancel(job)
-    assert ledger.demand() == 0

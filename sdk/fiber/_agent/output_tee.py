@@ -10,6 +10,7 @@ from __future__ import annotations
 import atexit
 import contextlib
 import io
+import os
 import sys
 import threading
 import time
@@ -81,7 +82,9 @@ class TeeFile:
     def __init__(self, file: OutputFile, times: bool = False) -> None:
         self._file = file
         self._times = times
-        self._lock = threading.Lock()
+        # A signal handler or finalizer of this thread may print meanwhile.
+        self._lock = threading.RLock()
+        os.register_at_fork(after_in_child=self._renew_lock)
         self._open: TeeStream | None = None
         """Stream whose line has no end."""
 
@@ -93,6 +96,10 @@ class TeeFile:
             if self._times:
                 data = _with_times(data, goes_on)
             self._append(data if goes_on or not before else b"\n" + data)
+
+    def _renew_lock(self) -> None:
+        # Another thread may have had it when the process forked.
+        self._lock = threading.RLock()
 
     def end_line(self, stream: TeeStream) -> None:
         """End the line of a stream."""

@@ -91,6 +91,8 @@ class BlobSender:
 
     def on_report(self, message: Lacking | Holding | Unfetched) -> None:
         """Handle what the agent says about a blob."""
+        if isinstance(message, Lacking) and message.digest in self._ordered:
+            return  # of an earlier start: the blob is on its way again
         if isinstance(message, Lacking):
             self._sent.pop(message.digest, None)
             if self._fanout is not None:

@@ -63,7 +63,7 @@ class Ledger:
         self.starting = 0
         self.leased = 0
         """Number of workers that callers lease."""
-        self._open_chunks = 0  # sum of the open chunks of ``jobs``
+        self._open_tasks = 0  # number of tasks of ``jobs`` that are fed and not done
         self._seq = itertools.count(1)
         self._turns: deque[Job] = deque()
         self._paused: set[Job] = set()
@@ -145,7 +145,7 @@ class Ledger:
         if job in self.jobs:
             self.jobs.discard(job)
             self._paused.discard(job)
-            self._open_chunks -= job.open_chunks
+            self._open_tasks -= job.fed - job.done
         holders = []
         for batch in job.batches:
             batch.job = None
@@ -238,12 +238,12 @@ class Ledger:
         return next(iter(self._load.idle), None)
 
     def demand(self) -> int:
-        """Return how many chunks run or wait for a worker, without those that a pause holds back.
+        """Return how many tasks run or wait for a worker, without those that a pause holds back.
 
-        A chunk is work for one worker. A cancelled batch that a worker still has counts as a chunk.
+        A cancelled batch that a worker still has counts as one.
         """
-        held_back = sum([job.held_back_chunks for job in self._paused]) if self._paused else 0
-        return self._open_chunks - held_back + len(self._cancelled)
+        held_back = sum([job.never_given for job in self._paused]) if self._paused else 0
+        return self._open_tasks - held_back + len(self._cancelled)
 
     def has_assignable(self) -> bool:
         """Return True if a worker may get a task."""
@@ -452,11 +452,13 @@ class Ledger:
     def retry(self, receipt: Receipt, index: int) -> bool:
         """Run a task again because of its result; return False if it has no tries left."""
         job = receipt.job
-        if (job not in self.jobs and not job.finished) or not job.charges.charge(index):
-            return False  # it is cancelled, or has no tries left
+        if job not in self.jobs and not job.finished:
+            return False  # cancelled
+        if not job.charges.charge(index):
+            return False
         if job not in self.jobs:  # the job was finished by this task
             self.jobs.add(job)
-            self._open_chunks += job.open_chunks
+            self._open_tasks += job.fed - job.done
         self._add_done(job, -1)
         span = Span(index, [receipt.item(index)], True, receipt.batch.pin)
         if span.pin:
@@ -568,16 +570,14 @@ class Ledger:
     # Steps of the methods above
 
     def _add_fed(self, job: Job, tasks: int) -> None:
-        self._open_chunks -= job.open_chunks
         job.fed += tasks
-        self._open_chunks += job.open_chunks
+        self._open_tasks += tasks
 
     def _add_done(self, job: Job, tasks: int) -> None:
         """Count tasks of the job that are done (negative: that run again)."""
-        before = job.open_chunks
         job.done += tasks
         if job in self.jobs:
-            self._open_chunks += job.open_chunks - before
+            self._open_tasks -= tasks
 
     def _withdraw(self, batch: Batch, now: float) -> None:
         if batch.worker.left is not None:

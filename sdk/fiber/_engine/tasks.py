@@ -249,14 +249,9 @@ class Job:
         return bool(waiting) and not (self.paused and waiting.first() >= self.reached)
 
     @property
-    def open_chunks(self) -> int:
-        """Number of chunks that the job's tasks that are fed and not done make."""
-        return -(-(self.fed - self.done) // self.unit)
-
-    @property
-    def held_back_chunks(self) -> int:
-        """Number of open chunks that a pause holds back: their tasks were never given out."""
-        return self.open_chunks - -(-(self.reached - self.done) // self.unit)
+    def never_given(self) -> int:
+        """Number of the job's tasks that were never given out."""
+        return self.fed - self.reached
 
     @property
     def finished(self) -> bool:

@@ -186,8 +186,6 @@ class HubStream:
         """True while a reply is awaited or was given up."""
         self._begun: int | None = None
         """Number of the request that ``begin`` sent and ``finish`` has not read."""
-        self.place = 0
-        """Number of the place that the stream keeps in a wait list."""
         self._end = "its hub is gone"
         self._sock, to_its_hub = _dial(home)
         _streams.add(self)

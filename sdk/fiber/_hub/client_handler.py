@@ -19,12 +19,10 @@ from fiber._hub.hosted import (
     HostedWaitList,
     Parts,
 )
-from fiber._hub.meetings import Meeting
 from fiber._hub.protocol import (
     FOUR,
     GRANTING,
     HEAD,
-    MEETING,
     ONE,
     SECRET,
     SECRETS,
@@ -91,6 +89,10 @@ class PendingRequest:
             self._on_ok()
         self._handler.stream.send(ONE.pack(status, self._number, value), buffers)
 
+    def report(self) -> None:
+        """Send a reply before the last one: the request was understood."""
+        self._handler.stream.send(ONE.pack(Status.OK, self._number, 0))
+
     @property
     def number(self) -> int:
         """Number of the request on its stream."""
@@ -115,8 +117,6 @@ class ClientHandler:
         """Number of the last request that got a token, while the client may still give it up."""
         self._place: int | None = None
         """Place of the client in the wait list of a condition."""
-        self._meeting: Meeting | None = None
-        """Last wait of the client at a barrier."""
         self._claimed = False
         """True if the counter was lowered for this client, which has not confirmed that."""
         stream.handler = self
@@ -162,8 +162,6 @@ class ClientHandler:
         self.stream.finish(reason)
 
     def _leave(self) -> None:
-        if self._meeting is not None:
-            self._meeting.abandon()
         self._cancel()
         self._give_back()
         self._unclaim()
@@ -189,9 +187,6 @@ class ClientHandler:
             self._hosted.withdraw(request)
             if request.on_withdrawal is not None:
                 request.on_withdrawal()
-        meeting, self._meeting = self._meeting, None
-        if meeting is not None:
-            meeting.withdraw()
         return request
 
     def _request(
@@ -299,11 +294,7 @@ class ClientHandler:
     def cancel(self, message: Message) -> None:
         """Reply NO to the request that waits."""
         number = HEAD.unpack_from(message.payload)[1]
-        if self.waiting is None or self.waiting.number != number:
-            return
-        if self._meeting is not None:
-            self._meeting.withdraw()
-        else:
+        if self.waiting is not None and self.waiting.number == number:
             request = self._cancel()
             assert request is not None
             request.answer(Status.NO)
@@ -350,7 +341,7 @@ class ClientHandler:
         counter.add(len(items))
         self._channel().send(request, items)
         if items and self.waiting is request:
-            self.stream.send(ONE.pack(Status.OK, request.number, 0))
+            request.report()
             own_count = counter.duplicate()  # the client may end its use of the counter first
             request.on_withdrawal = lambda: own_count.lower(len(items))
 
@@ -501,7 +492,7 @@ class ClientHandler:
     def enter(self, message: Message) -> None:
         """Take a place, which the stream keeps."""
         self._place = self._wait_list().places.enter(afar=True)
-        self._request(message).answer(Status.OK, self._place)
+        self._request(message).answer(Status.OK)
 
     def _own_place(self) -> int:
         if self._place is None:
@@ -535,21 +526,6 @@ class ClientHandler:
         """Note how many things the process of this stream has."""
         self._wait_list().places.hold(self._own_place(), ONE.unpack(message.payload)[2])
 
-    def tally(self, message: Message) -> None:
-        """Change how many things the process of this stream has, and word 1."""
-        self._wait_list().places.tally(self._own_place(), _signed(ONE.unpack(message.payload)[2]))
-        self._request(message).answer(Status.OK)
-
-    def meet(self, message: Message) -> None:
-        """Wait at the barrier of this wait list."""
-        _, _, lock, members, place, parties, has_action = MEETING.unpack(message.payload)
-        lock, members = map(self._home.registry.hosted, (lock, members))
-        if not isinstance(lock, HostedSemaphore) or not isinstance(members, HostedWaitList):
-            raise RequestRefused("the request is not for a barrier")
-        request = self._request(message)
-        self._meeting = Meeting(request, lock, self._wait_list(), members)
-        self._meeting.begin(place, parties, bool(has_action))
-
     def held(self, message: Message) -> None:
         """Reply with the number of things that the processes of all places have."""
         self._request(message).answer(Status.OK, self._wait_list().places.held())
@@ -567,15 +543,11 @@ class ClientHandler:
     def set(self, message: Message) -> None:
         """Set one of the user's words."""
         _, _, number, value = TWO.unpack(message.payload)
-        self._wait_list().places.set(number & 1, _signed(value))
+        self._wait_list().places.set(number & 1, value - (1 << 64) if value >> 63 else value)
         self._request(message).answer(Status.OK)
 
 
 _WORD = (1 << 64) - 1
-
-
-def _signed(word: int) -> int:
-    return word - (1 << 64) if word >> 63 else word
 
 
 class _Joining:

@@ -306,7 +306,6 @@ class HostedSemaphore:
         self._semaphore = SharedSemaphore(block, COUNTING)
         self._waiters: deque[tuple[Waiter, Callable[[bool], None]]] = deque()
         self._is_listening = False
-        self._is_serving = False
         self._revival = threading.Thread()  # none yet
 
     def acquire(self, waiter: Waiter, granted: Callable[[bool], None]) -> None:
@@ -358,15 +357,6 @@ class HostedSemaphore:
         self._stop_listening()
 
     def _serve(self) -> None:
-        if self._is_serving:  # a waiter has released its token at once; the caller goes on
-            return
-        self._is_serving = True
-        try:
-            self._serve_waiters()
-        finally:
-            self._is_serving = False
-
-    def _serve_waiters(self) -> None:
         while self._waiters and (result := self._semaphore.try_acquire()):
             waiter, granted = self._waiters.popleft()
             tracked = not self._semaphore.is_untracked()

@@ -126,11 +126,6 @@ class Op(IntEnum):
     HOLD = 58  # number of things of the stream's process; silent
     RECLAIM = 59  # token of a counter, which is raised by -> number of things of dead processes
     HELD = 61  # -> number of things of all processes
-    TALLY = 62  # number, may be negative: the stream's process has so many more, and so has word 1
-    MEET = (
-        63  # a barrier: tokens of lock and members, place among them, parties, 1 for an action ->
-    )
-    # index; BROKEN; or NO if the process has to take the steps itself
 
 
 class Status(IntEnum):
@@ -183,7 +178,6 @@ FOUR = struct.Struct("<BIQQQQ")
 ONE = struct.Struct("<BIQ")
 SECRET = struct.Struct(f"<BI{_SECRET}")
 SECRETS = struct.Struct(f"<BI{_SECRET}{_SECRET}")
-MEETING = struct.Struct(f"<BI{_SECRET}{_SECRET}QQQ")
 GRANTING = struct.Struct(f"<BIQ{_SECRET}")
 
 

@@ -51,6 +51,7 @@ _SURPLUS_CHECK_INTERVAL = 0.2
 
 _TRANSFER_POLL_INTERVAL = 1e-4
 """Seconds between two reads of the counts while an item goes from one count to the other."""
+_READS = 1000
 
 
 PutItems = Callable[[Sequence[Item]], AbstractContextManager[None]]
@@ -232,8 +233,12 @@ class Feeder:
             self._start_thread()
 
     def size(self) -> int:
-        """Return the number of items in the channel and in this process."""
-        while True:
+        """Return the number of items in the channel and in this process.
+
+        If items go on all the time, one that is on its way may be counted twice or not at all.
+        """
+        size = 0
+        for _ in range(_READS):
             steps = self._transfer_steps
             size = self._slots.used(len(self._unsent))
             consistent = steps == self._transfer_steps and not steps % 2
@@ -241,6 +246,7 @@ class Feeder:
             if consistent or is_feeder:
                 return size
             time.sleep(_TRANSFER_POLL_INTERVAL)
+        return size
 
     def _send_now(self, payload: bytes, buffers: list[memoryview]) -> bool:
         self._slots.sending()

@@ -29,7 +29,7 @@ from fiber._hub.handles import (
     ring_doorbell,
 )
 from fiber._hub.heap import Block, block_of
-from fiber._hub.protocol import MEETING, ONE, SECRET, TWO, Extent, ObjectKind, Op, Origin, Status
+from fiber._hub.protocol import ONE, SECRET, TWO, Extent, ObjectKind, Op, Origin, Status
 from fiber._hub.remote import RemoteCounter, RemoteObject
 from fiber._sync.semaphore import RECURSIVE, SEMAPHORE_SIZE, Abandoned, SharedSemaphore
 from fiber._sync.wait_list import WAIT_LIST_SIZE, WaitList
@@ -260,7 +260,7 @@ class RemoteWaitList(RemoteObject):
         stream = self._pop(self._idle)
         try:
             stream.settle()
-            (stream.place,) = stream.ask(Op.ENTER).values
+            stream.ask(Op.ENTER)
         except BaseException:
             with suppress(OSError, ObjectUnreachable):
                 stream.say(Op.LEAVE)
@@ -301,39 +301,10 @@ class RemoteWaitList(RemoteObject):
         """Note how many things the process at ``place`` has.  Never waits."""
         place.say(Op.HOLD, number, form=ONE)
 
-    def tally(self, place: HubStream, by: int) -> None:
-        """Change the number of things of the process at ``place``, and the user's second word."""
-        place.ask(Op.TALLY, by & _WORD, form=ONE)
-
-    def meet(
-        self,
-        lock: RemoteSemaphore,
-        members: RemoteWaitList,
-        place: HubStream,
-        parties: int,
-        has_action: bool,
-        timeout: float,
-    ) -> int | None:
-        """Wait at the barrier of this wait list, and return the index of this thread.
-
-        BrokenBarrierError if it is broken.  None after ``timeout`` seconds, or if this thread has
-        to take the steps itself: then it does not count as waiting.
-        """
-        secrets = lock.known(), members.known()
-        with self.stream() as stream:
-            reply = stream.ask(
-                Op.MEET,
-                *secrets,
-                place.place,
-                parties,
-                has_action,
-                form=MEETING,
-                timeout=timeout,
-            )
-        if reply.status is Status.BROKEN:
-            raise threading.BrokenBarrierError
-        index: int = reply.values[0]
-        return index if reply.status is Status.OK else None
+    def tally(self, place: HubStream, held: int, total: int) -> None:
+        """Note how many things the process at ``place`` has, and set the user's second word."""
+        self.hold(place, held)
+        place.ask(Op.SET, 1, total, form=TWO)
 
     def held(self) -> int:
         """Return the number of things that the processes of all places have."""
@@ -353,15 +324,13 @@ class RemoteWaitList(RemoteObject):
     def set(self, number: int, value: int) -> None:
         """Set one of the user's two words."""
         with self.stream() as stream:
-            stream.ask(Op.SET, number, value & _WORD, form=TWO)
+            stream.ask(Op.SET, number, value & ((1 << 64) - 1), form=TWO)
 
     def _ask(self, operation: Op, number: int) -> int:
         with self.stream() as stream:
             value: int = stream.ask(operation, number, form=ONE).values[0]
         return value
 
-
-_WORD = (1 << 64) - 1
 
 AnyWaitList: TypeAlias = WaitList | RemoteWaitList
 

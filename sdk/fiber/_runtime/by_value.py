@@ -20,6 +20,9 @@ from fiber import reduction
 from fiber._agent.by_value import FUNCTIONS, FunctionByValue
 from fiber._wire import work
 
+LARGEST = 1 << 16
+"""Bytes of the largest pickle that is kept, here and in each worker."""
+
 
 class FunctionPickles:
     """Pickles of functions that travel by value.  Runs on any thread."""
@@ -44,6 +47,8 @@ class FunctionPickles:
         try:
             data = reduction.dumps_by_value(function)
         except Exception:  # pickling the whole call raises it again, and names the culprit
+            return None
+        if len(data) > LARGEST:
             return None
         if not reads.are_same():  # another thread changed a global meanwhile
             return None
@@ -171,6 +176,8 @@ _CONSTANT = frozenset({CodeType, range, type(...), type(NotImplemented)})
 
 def _parts_of(value: Any) -> Iterable[Any] | None:
     """Return the parts of a value that changes only if they do; None if it may change itself."""
+    if isinstance(value, type):  # of the session
+        return None
     if type(value) in (tuple, frozenset):
         return tuple(value)
     annotation = isinstance(value, types.GenericAlias | types.UnionType)

@@ -74,6 +74,8 @@ class CallCounts:
 
     def since_note(self) -> tuple[int, int, float]:
         """Return the calls, failed calls and seconds since the last note, and note them."""
+        if self.calls == self.noted[0]:  # the caller counts a call at this moment, at most
+            return 0, 0, 0.0
         before, self.noted = self.noted, (self.calls, self.failed, self.seconds)
         calls, failed, seconds = self.noted
         return calls - before[0], failed - before[1], seconds - before[2]

@@ -27,7 +27,7 @@ WAIT_LIST_SIZE = (1 << 16) - 64
 _TICKET = 0
 _USERS = 1
 _END = 3  # end of the places that were ever taken
-PLACES = range(8, WAIT_LIST_SIZE // 8, 8)
+_PLACES = range(8, WAIT_LIST_SIZE // 8, 8)
 # Words of a place
 _STATE = 0
 _WHO = 1  # identity of the process; 0 if the place is free
@@ -58,7 +58,7 @@ class WaitList:
         """Take a place for this thread; ``afar``: it is for a process of another host."""
         words = self._words
         place = self._free_place()
-        words[_END] = max(words[_END], place + PLACES.step)
+        words[_END] = max(words[_END], place + _PLACES.step)
         make_semaphore(self._bell(place), 0)
         words[place] = _WAITS_AFAR if afar else _WAITS
         words[_TICKET] = words[place + _CAME] = words[_TICKET] + 1
@@ -122,10 +122,10 @@ class WaitList:
         """Note how many things the process at ``place`` has.  Needs no lock."""
         self._words[place + _HELD] = number
 
-    def tally(self, place: int, by: int) -> None:
-        """Change the number of things of the process at ``place``, and the user's second word."""
-        self._words[place + _HELD] += by
-        self._words[_USERS + 1] += by
+    def tally(self, place: int, held: int, total: int) -> None:
+        """Note how many things the process at ``place`` has, and set the user's second word."""
+        self._words[place + _HELD] = held
+        self.set(1, total)
 
     def held(self) -> int:
         """Return the number of things that the processes of all places have."""
@@ -152,9 +152,9 @@ class WaitList:
 
     def _free_place(self) -> int:
         for is_free in (self._is_unused, self._is_dead):
-            for place in filter(is_free, PLACES):
+            for place in filter(is_free, _PLACES):
                 return place
-        raise OSError(f"more than {len(PLACES)} threads wait at one condition")
+        raise OSError(f"more than {len(_PLACES)} threads wait at one condition")
 
     def _bell(self, place: int) -> int:
         return self.block.address + 8 * (place + _BELL)
@@ -163,7 +163,7 @@ class WaitList:
         return not self._words[place + _WHO]
 
     def _used(self) -> Iterator[int]:
-        places = range(PLACES.start, self._words[_END], PLACES.step)
+        places = range(_PLACES.start, self._words[_END], _PLACES.step)
         return (place for place in places if self._words[place + _WHO])
 
     def _is_dead(self, place: int) -> bool:
