@@ -127,6 +127,16 @@ def test_a_process_with_a_gpu_runs_on_a_node_that_has_one(
         scene.kube.patch(path, {"status": {"capacity": {GPU: None}}})
 
 
+def test_pods_pass_a_large_array_on(programs: Programs, scene: Scene) -> None:
+    program = programs.start("outside", "broadcasting.py")
+    done = program.says("done")
+    assert done["right"]
+    assert len(set(done["hosts"])) == 6
+    assert 1 <= done["copies"] < 6
+    program.ends()
+    leaves_nothing(program)
+
+
 def test_a_warm_pool_is_given_back_as_it_was(programs: Programs, scene: Scene, agent: Body) -> None:
     warm = Pool(scene, "warm").apply(agent, minReplicas=2)
     there = warm.ready(2)
