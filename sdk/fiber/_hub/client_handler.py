@@ -327,16 +327,12 @@ class ClientHandler:
         self._channel().send(self._request(message), deque([(payload, buffers)]))
 
     def put_items(self, message: Message) -> None:
-        """Count a message or those of a bundle, reply, and send them.
+        """Count the messages of a bundle, reply, and send them.
 
         When the client ends, messages that are not sent yet are dropped and no longer counted.
         """
-        _, _, is_bundle, token = GRANTING.unpack(message.payload)
-        counter = self._checked(self._home.registry.hosted(token))
-        payload, *buffers = message.buffers
-        items: deque[Parts] = deque([(payload, buffers)])
-        if is_bundle:
-            items = deque((item, ()) for item in bundle.unpack(payload))
+        counter = self._counter_named_in(message)
+        items: deque[Parts] = deque((item, ()) for item in bundle.unpack(message.buffers[0]))
         request = self._request(message)
         counter.add(len(items))
         self._channel().send(request, items)

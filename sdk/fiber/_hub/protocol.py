@@ -98,8 +98,7 @@ class Op(IntEnum):
     WATCH = 14  # silent; the stream gets READY once the channel is readable
     CHECK = 15  # NO if it is not readable now; then as WATCH
     DRAW = 16  # token of a counter -> as RECV; raises that counter by one
-    # 1 if a bundle is beside it, 0 for one message; token of a counter
-    PUT_ITEMS = 17  # -> 0 once counted, unless they are sent at once; then 1 once sent
+    PUT_ITEMS = 17  # token of a counter; a bundle beside it -> 0 once counted, then 1 once sent
     GET_ITEM = 18  # token of a counter -> as RECV; lowers that counter by one
     # For an attached counter
     ADD = 20  # how much

@@ -35,7 +35,7 @@ from fiber._hub import local, shared_blocks
 from fiber._hub.client import ObjectUnreachable
 from fiber._hub.handles import collecting_grants
 from fiber._hub.local import LocalChannel, LocalCounter, ReceivingEnd, SendingEnd
-from fiber._hub.remote import Item, RemoteChannel, RemoteCounter, RemoteObject
+from fiber._hub.remote import RemoteChannel, RemoteCounter, RemoteObject
 from fiber._hub.shared_blocks import AnySemaphore, AnyWaitList
 from fiber._sync.semaphore import COUNTING
 from fiber._transport.channels import Channel, SharedChannel, SharedCounter
@@ -54,7 +54,7 @@ _TRANSFER_POLL_INTERVAL = 1e-4
 _READS = 1000
 
 
-PutItems = Callable[[Sequence[Item]], AbstractContextManager[None]]
+PutItems = Callable[[Sequence[bytes]], AbstractContextManager[None]]
 """Function that sends items.  They are counted when its context begins."""
 
 
@@ -206,7 +206,7 @@ class Feeder:
         self._put_items = slots.put_items(outbox)
         self._on_error = on_error
         self._close_outbox = close
-        self._unsent: deque[Item] = deque()
+        self._unsent: deque[tuple[bytes, list[memoryview]]] = deque()
         # True when there are items, False at the end.
         self._wake: SimpleQueue[bool] = SimpleQueue()
         self._sending = False
@@ -299,10 +299,8 @@ class Feeder:
             more = self._wake.get()
             self._sending = True
             while self._unsent:
-                if self._put_items is None:
+                if self._put_items is None or not self._send_bundle(self._put_items):
                     self._send_next()
-                else:
-                    self._send_together(self._put_items)
             self._sending = False
         self._close_outbox()
 
@@ -314,18 +312,19 @@ class Feeder:
         if reachable:
             self._send(*item)
 
-    def _send_together(self, put_items: PutItems) -> None:
-        """Send the next items in one request: a large one, or small ones.
+    def _send_bundle(self, put_items: PutItems) -> bool:
+        """Send the next small items in one request; False if the next item is large.
 
         While a request is on its way, further items gather for the next one.
         """
         self._transfer_steps += 1
         counted = False
-        items = self._take_next()
+        items = self._take_small()
         try:
-            with put_items(items):
-                self._transfer_steps += 1
-                counted = True
+            if items:
+                with put_items(items):
+                    self._transfer_steps += 1
+                    counted = True
         except (BrokenPipeError, EOFError):
             self._unsent.clear()  # no process can ever read them
         except OSError as error:
@@ -333,17 +332,19 @@ class Feeder:
                 self._report(error)
         if not counted:
             self._transfer_steps += 1
+        return bool(items)
 
-    def _take_next(self) -> list[Item]:
-        """Take the next item, and as many more as a bundle holds."""
-        items = [self._unsent.popleft()]
-        room = bundle.LIMIT - packet.size_of(*items[0])
-        while self._unsent and not items[0][1]:
+    def _take_small(self) -> list[bytes]:
+        """Take as many items as a bundle holds."""
+        items: list[bytes] = []
+        room = bundle.LIMIT
+        while self._unsent:
             payload, buffers = self._unsent[0]
             room -= len(payload)
             if buffers or room < 0:
                 break
-            items.append(self._unsent.popleft())
+            items.append(payload)
+            self._unsent.popleft()
         return items
 
     def _count_as_sent(self) -> bool:

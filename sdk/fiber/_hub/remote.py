@@ -19,7 +19,6 @@ from typing import Any, TypeAlias
 
 from fiber._hub.client import HubStream, ObjectUnreachable, Reply
 from fiber._hub.protocol import (
-    GRANTING,
     HEAD,
     NO_SECRET,
     ONE,
@@ -160,10 +159,6 @@ class RemoteObject:
         """Handle the late reply to a request that was given up (Ctrl-C)."""
 
 
-Item: TypeAlias = tuple[bytes, list[memoryview]]
-"""Item of a queue: its pickle, and the buffers beside it."""
-
-
 class RemoteChannel(RemoteObject):
     """End of a message pipe on another host; a ``SharedChannel``."""
 
@@ -245,19 +240,15 @@ class RemoteChannel(RemoteObject):
         return self._receive(Op.GET_ITEM, counter.known(), form=SECRET, timeout=timeout)
 
     @contextmanager
-    def put_items(self, items: Sequence[Item], counter: RemoteCounter) -> Iterator[None]:
-        """Send one message, or several without buffers; the hub raises ``counter`` accordingly.
+    def put_items(self, items: Sequence[bytes], counter: RemoteCounter) -> Iterator[None]:
+        """Send messages, and have the hub raise ``counter`` by their number.
 
         They are counted when the context begins, and can be received when it ends.
         """
         token = counter.known()
         with _naming_the_end(), self.stream() as stream:
-            if is_bundle := len(items) > 1:
-                parts = [memoryview(bundle.pack(payload for payload, _ in items))]
-            else:
-                ((payload, buffers),) = items
-                parts = [memoryview(payload), *buffers]
-            reply = stream.ask(Op.PUT_ITEMS, is_bundle, token, form=GRANTING, buffers=parts)
+            parts = [memoryview(bundle.pack(items))]
+            reply = stream.ask(Op.PUT_ITEMS, token, form=SECRET, buffers=parts)
             yield
             if reply.status is Status.OK and not reply.values[0]:
                 reply = stream.ask_on()
