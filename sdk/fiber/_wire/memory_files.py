@@ -359,8 +359,11 @@ class Blob:
 
         blob = cls.__new__(cls)
         blob.digest, blob.data = digest, b""
-        with tempfile.TemporaryFile(dir=directory) as file:
-            blob._file = own(os.dup(file.fileno()))
+        try:
+            with tempfile.TemporaryFile(dir=directory) as file:
+                blob._file = own(os.dup(file.fileno()))
+        except FileNotFoundError:  # a user has removed the directory
+            blob._file = own(os.memfd_create("fiber-blob"))
         _write_all(blob._file.fileno(), data)
         return blob
 
