@@ -73,8 +73,8 @@ def _parse(arguments: Sequence[str]) -> argparse.Namespace:
         metavar="A,B",
         help=f"any of {','.join(BY_NAME)}; default: all that are installed",
     )
-    parser.add_argument("--rounds", type=_count, help=f"default {_ROUNDS}; 1 with --quick")
-    parser.add_argument("--size", type=_share, help="share of the full amount of work, default 1")
+    parser.add_argument("--rounds", type=count_of, help=f"default {_ROUNDS}; 1 with --quick")
+    parser.add_argument("--size", type=share_of, help="share of the full amount of work, default 1")
     parser.add_argument(
         "--quick",
         action="store_true",
@@ -98,13 +98,15 @@ def _names(text: str) -> list[str]:
     return names
 
 
-def _count(text: str) -> int:
+def count_of(text: str) -> int:
+    """Return the number of an option, which is at least 1."""
     if (count := int(text)) < 1:
         raise argparse.ArgumentTypeError(f"{count} is less than 1")
     return count
 
 
-def _share(text: str) -> float:
+def share_of(text: str) -> float:
+    """Return the share of an option, which is above 0 and up to 1."""
     if not 0 < (share := float(text)) <= 1:
         raise argparse.ArgumentTypeError(f"{share:g} is not above 0 and up to 1")
     return share

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks import machine, processes
+from benchmarks.command import count_of, share_of
 from benchmarks.contenders import BY_NAME, Contender
 from benchmarks.model import Case, Run
 from benchmarks.paper import packages, page, pictures
@@ -129,8 +130,8 @@ def _parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument(
         "--workers", type=_numbers, metavar="N,M", help="default: all numbers that a part has"
     )
-    parser.add_argument("--rounds", type=_count, help=f"default {_ROUNDS}; 1 with --quick")
-    parser.add_argument("--size", type=_share, help="share of the full amount of work, default 1")
+    parser.add_argument("--rounds", type=count_of, help=f"default {_ROUNDS}; 1 with --quick")
+    parser.add_argument("--size", type=share_of, help="share of the full amount of work, default 1")
     parser.add_argument(
         "--minutes", type=float, default=_MINUTES, help="training of the walker, default 15"
     )
@@ -157,16 +158,4 @@ def _names(text: str) -> list[str]:
 
 
 def _numbers(text: str) -> list[int]:
-    return [_count(each) for each in text.split(",")]
-
-
-def _count(text: str) -> int:
-    if (count := int(text)) < 1:
-        raise argparse.ArgumentTypeError(f"{count} is less than 1")
-    return count
-
-
-def _share(text: str) -> float:
-    if not 0 < (share := float(text)) <= 1:
-        raise argparse.ArgumentTypeError(f"{share:g} is not above 0 and up to 1")
-    return share
+    return [count_of(each) for each in text.split(",")]

@@ -24,6 +24,7 @@ from e2e.kube import Body
 from e2e.person import Person
 from e2e.program import PROGRAMS, Programs
 from e2e.scene import Scene
+from e2e.test_program import workers
 from fiber_api import names
 from patience import PATIENCE
 
@@ -32,6 +33,7 @@ pytestmark = pytest.mark.timeout(300, func_only=True)
 ADDRESS = re.compile(r"http://127\.0\.0\.1:\d+/\?token=\S+")
 ROOT = Path(__file__).parents[2]
 CELL = """
+import socket
 import fiber
 
 def square(number):
@@ -39,7 +41,7 @@ def square(number):
 
 with fiber.Pool(2) as pool:
     print(sum(pool.map(square, range(100), progress="squares")))
-    hosts = {worker.host for worker in pool.workers()}
+    hosts = set(pool.broadcast(socket.gethostname))  # both, though one may start after the map
 print(" ".join(sorted(hosts)))
 """
 
@@ -50,12 +52,6 @@ def person(scene: Scene, programs: Programs, cluster: Cluster, tmp_path: Path) -
     person = Person(scene, programs, tmp_path, cluster.images["fiber-worker"])
     (tmp_path / "observed.py").write_text((PROGRAMS / "observed.py").read_text(encoding="utf-8"))
     return person
-
-
-def worker_pods(scene: Scene) -> list[Body]:
-    """Return the pods of pools that are there."""
-    pods = scene.now["pods"].values()
-    return [pod for pod in pods if names.LABEL_POOL in pod["metadata"].get("labels", {})]
 
 
 async def last_update(address: str, deaths: int) -> dict[str, Any]:
@@ -131,7 +127,7 @@ def test_a_program_in_a_pod_is_seen_in_its_page_and_its_metrics(
     scene = person.scene
     before = asyncio.run(last_update(page, deaths=0))
     scraped = metrics_of(scene, scene.now["pods"][person.pod("mine")])
-    victims = worker_pods(scene)
+    victims = workers(scene)
     for pod in victims:
         cluster.kill(pod, names.WORKER_CONTAINER)
     after = asyncio.run(last_update(page, deaths=len(victims)))
@@ -154,7 +150,7 @@ def test_the_timeline_shows_pods_and_their_ends(
     path = tmp_path / "run.json"
     program = programs.start("outside", "observed.py", timeline=path)
     program.says("waiting")
-    victims = worker_pods(scene)
+    victims = workers(scene)
     for pod in victims:
         cluster.kill(pod, names.WORKER_CONTAINER)
     program.ends()

@@ -82,7 +82,7 @@ class BlobSender:
         digest = blob.digest
         self._leaving[digest] = self._leaving.get(digest, 0) + 1
         if self._fanout is not None and len(blob.data) >= WORTH:
-            if digest in self._ordered:  # it was lost on its way
+            if digest in self._ordered:  # it was forgotten on its way
                 self._leaving[digest] -= 1
             self._ordered.add(digest)
             self._fanout.want(self, blob)
@@ -91,9 +91,9 @@ class BlobSender:
 
     def on_report(self, message: Lacking | Holding | Unfetched) -> None:
         """Handle what the agent says about a blob."""
-        if isinstance(message, Lacking) and message.digest in self._ordered:
-            return  # of an earlier start: the blob is on its way again
         if isinstance(message, Lacking):
+            if message.digest in self._ordered:
+                return  # of an earlier start: the blob is on its way again
             self._sent.pop(message.digest, None)
             if self._fanout is not None:
                 self._fanout.gone(self, message.digest)

@@ -52,6 +52,7 @@ _SURPLUS_CHECK_INTERVAL = 0.2
 _TRANSFER_POLL_INTERVAL = 1e-4
 """Seconds between two reads of the counts while an item goes from one count to the other."""
 _READS = 1000
+"""Reads of the counts after which ``size`` takes what it has read."""
 
 
 PutItems = Callable[[Sequence[bytes]], AbstractContextManager[None]]

@@ -20,8 +20,8 @@ from fiber import reduction
 from fiber._agent.by_value import FUNCTIONS, FunctionByValue
 from fiber._wire import work
 
-LARGEST = 1 << 16
-"""Bytes of the largest pickle that is kept, here and in each worker."""
+FUNCTION_SIZE = 1 << 16
+"""Bytes of the largest pickle of a function that is kept, here and in a FunctionCache."""
 
 
 class FunctionPickles:
@@ -48,7 +48,7 @@ class FunctionPickles:
             data = reduction.dumps_by_value(function)
         except Exception:  # pickling the whole call raises it again, and names the culprit
             return None
-        if len(data) > LARGEST:
+        if len(data) > FUNCTION_SIZE:
             return None
         if not reads.are_same():  # another thread changed a global meanwhile
             return None

@@ -20,15 +20,11 @@ from fiber._engine.chunks import TaskPace
 from fiber._engine.fanout import COPIES, WORTH
 from fiber._engine.tasks import Job, Limits
 from fiber._hub.handles import GrantSet
-from fiber._runtime.by_value import FunctionPickles
+from fiber._runtime.by_value import FUNCTION_SIZE, FunctionPickles
 from fiber._runtime.threads import check_may_wait
 from fiber._transport.loop import DOZE
 from fiber._wire import packet, work
 from fiber._wire.memory_files import share
-
-FUNCTION_SIZE = 1 << 16
-"""Largest pickle, in bytes, that a FunctionCache keeps."""
-
 
 AHEAD = 3
 """Messages for each worker whose tasks a stream reads before the worker can take them."""
