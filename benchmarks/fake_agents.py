@@ -12,14 +12,15 @@ from __future__ import annotations
 
 import itertools
 import pickle
+import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
 from benchmarks import tasks
 
+from fiber._agent import batch_results, worker
 from fiber._agent.interface import ChildObserver, ChildSpec, ExitReport
-from fiber._agent.worker import BatchRunner
 from fiber._transport.loop import Loop
 from fiber._wire import work
 from fiber._wire.memory_files import BytesLike
@@ -179,25 +180,34 @@ class FakeChild:
 class TaskRunner:
     """Real worker that runs the tasks of all fake children of a process, one child after the other.
 
-    One serves all, because a worker may start a thread that watches over long batches.
+    One serves all, because a worker may start a thread that watches over long batches. Its clock
+    includes the seconds that tasks pretend to take: a worker reports how long its tasks took, and
+    the pool sends a worker several tasks at once if they are short.
     """
 
     def __init__(self) -> None:
         self._answers: list[Answer] = []
-        self._seconds = 0.0
-        self._worker = BatchRunner(self, memoryview(bytearray(_BOARD)).cast("Q"))
+        self._pretended = 0.0
+        self._worker = worker.BatchRunner(self, memoryview(bytearray(_BOARD)).cast("Q"))
         tasks.pretend = self._pretend
+        for module in (worker, batch_results):
+            module.time = self  # type: ignore[attr-defined]
 
     def run(self, message: Message) -> tuple[list[Answer], float, bool]:
         """Run a message. Return the answers, the seconds that its tasks would take, and False if it
         asks the worker to stop."""
-        self._answers, self._seconds = [], 0.0
+        before = self._pretended
+        self._answers = []
         goes_on = self._worker.handle(message)
-        return self._answers, self._seconds, goes_on
+        return self._answers, self._pretended - before, goes_on
 
     def send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
         """Keep an answer of the worker for the child whose turn it is."""
         self._answers.append((bytes(payload), buffers))
 
+    def perf_counter(self) -> float:
+        """Return the time of the worker's clock, in seconds."""
+        return time.perf_counter() + self._pretended
+
     def _pretend(self, seconds: float) -> None:
-        self._seconds += seconds
+        self._pretended += seconds

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import pickle
 import sys
+import time
 from pathlib import Path
 from typing import Any, cast
 from unittest.mock import Mock
@@ -29,6 +31,7 @@ from benchmarks.paper import (  # noqa: E402
 )
 from benchmarks.paper.schedule import list_schedule  # noqa: E402
 
+from fiber._agent import batch_results, worker  # noqa: E402
 from fiber._wire import work  # noqa: E402
 from fiber._wire.packet import Message  # noqa: E402
 
@@ -167,12 +170,26 @@ def test_a_busy_child_answers_and_goes_on_when_its_task_ends() -> None:
     assert not loop.later
 
 
-def test_a_task_pretends_for_its_child_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def _pretend(seconds: float) -> None:
+    tasks.pretend(seconds)
+
+
+def test_the_clock_of_a_worker_includes_the_seconds_that_its_tasks_pretend(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A pool that is told of tasks without a duration sends several to a worker, one after
+    the other, while other workers wait."""
     monkeypatch.setattr(tasks, "pretend", tasks.pretend)
+    for module in (worker, batch_results):
+        monkeypatch.setattr(module, "time", time)
     runner = fake_agents.TaskRunner()
-    tasks.pretend(1000.0)
-    tasks.pretend(500.0)
-    assert runner._seconds == 1500.0
+    call = pickle.dumps((_pretend, (1000.0,), {}))
+    payload = work.SEQ.pack(1) + work.pack_calls([(call, ())])
+    answers, seconds, goes_on = runner.run(Message(memoryview(payload), [], []))
+    assert (seconds, goes_on) == (1000.0, True)
+    ((answer, _),) = answers
+    took = pickle.loads(answer)[3]
+    assert 1000.0 <= took < 1100.0
 
 
 # -- Learning
