@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Protocol
@@ -290,15 +291,11 @@ class Audit:
             account = self._names.account(job)
             if account is not None:
                 _check_places(job, account, where)
-        self._check_demand(places)
+        self._check_demand()
         self._check_idle()
 
-    def _check_demand(self, places: dict[Job, list[tuple[str, int, int]]]) -> None:
-        wanted = sum(
-            max(0, min(size, job.reached - first)) if job.paused and place == "waiting" else size
-            for job, where in places.items()
-            for place, first, size in where
-        )
+    def _check_demand(self) -> None:
+        wanted = workers_wanted(self._ledger)
         # A worker that runs a cancelled task takes no other.
         unwanted = sum(
             len(batch.items) - batch.received
@@ -307,7 +304,7 @@ class Audit:
         )
         demand = self._ledger.demand()
         fits = wanted <= demand <= wanted + unwanted
-        require(fits, f"the demand is {demand} for {wanted} tasks and {unwanted} cancelled ones")
+        require(fits, f"the demand is {demand}, not {wanted}, with {unwanted} cancelled tasks")
 
     def _check_workers(self) -> None:
         held = 0
@@ -370,6 +367,26 @@ class Audit:
         require(not any(job.closed for job in ledger.jobs), "a finished job is left over")
         require(not any(worker.queue for worker in ledger.workers), "a worker is left busy")
         require(ledger.starting == 0, f"{ledger.starting} workers never started")
+
+
+def workers_wanted(ledger: Ledger) -> int:
+    """Return how many workers the tasks could use that run or wait, cancelled ones left out."""
+    pins = sum(len(worker.pinned) for worker in ledger.workers) + len(ledger._unassigned_pins)
+    return pins + sum(map(_wanted, ledger.jobs))
+
+
+def _wanted(job: Job) -> int:
+    """Return how many workers the job's tasks could use that wait, or that workers have."""
+    wanted = 0
+    for stock in job.waiting._stocks:
+        size = len(stock)
+        if job.paused:
+            wanted += max(0, min(size, job.reached - stock.start - stock.position))
+        else:
+            wanted += size if stock.alone else math.ceil(size / job.unit)
+    open_tasks = sum(batch.stop - batch.start - batch.received for batch in job.batches)
+    units = sum(math.ceil(len(batch.items) / job.unit) for batch in job.batches)
+    return wanted + min(open_tasks, units)
 
 
 def _check_places(job: Job, account: Account, places: list[tuple[str, int, int]]) -> None:

@@ -21,6 +21,7 @@ from fiber._engine.tasks import Loss
 from fiber._runtime.executor import PoolExecutor
 from fiber._runtime.jobs import TICK
 from fiber._runtime.work_items import AHEAD, InputStream, WorkItem
+from simulation.audit import workers_wanted
 from simulation.oracle import require
 from simulation.world import MOMENTS
 
@@ -211,10 +212,7 @@ class PoolAudit:
         workers = self._workers
         if self._scheduler.terminated or workers.error is not None or workers.starting:
             return False
-        # A caller does not fetch results that wait until earlier ones are read.
-        tasks = sum(
-            (job.reached if job.paused else job.fed) - job.done for job in self._ledger.jobs
-        )
+        tasks = workers_wanted(self._ledger)
         # A worker that still runs a cancelled task is not free for others.
         held_up = [it for it in self._ledger.workers if it.queue and not it.leaving]
         lost = sum(worker.queue[0].job is None for worker in held_up)

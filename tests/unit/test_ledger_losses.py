@@ -273,6 +273,45 @@ def test_demand_counts_waiting_and_running_tasks() -> None:
     assert ledger.assign(0.0) is None
 
 
+def test_demand_counts_the_tasks_of_a_chunk_as_one() -> None:
+    ledger, _ = ledger_with(2)
+    job_of(ledger, range(50), unit=24)
+    assert ledger.demand() == 3, "two whole chunks and one of two tasks"
+    batches = assign_all(ledger)
+    assert ledger.demand() == 3
+    ledger.receive(batches[0].worker, batches[0].seq, 0, 23, 0.0)
+    assert ledger.demand() == 3, "the chunk is not done"
+    answer(ledger, batches[0])
+    assert ledger.demand() == 2
+
+
+def test_demand_counts_each_suspect_of_a_lost_chunk() -> None:
+    ledger, (worker,) = ledger_with(1)
+    job_of(ledger, range(24), unit=24)
+    (batch,) = assign_all(ledger)
+    ledger.lose(worker, [], (batch.seq, 0))
+    alone = batch.stride
+    assert ledger.demand() == (alone if alone == 24 else alone + 1)
+
+
+def test_demand_counts_the_tasks_that_a_worker_gives_back_by_chunks() -> None:
+    ledger, (worker,) = ledger_with(1)
+    job_of(ledger, range(6), unit=2, pace=known(1e-6))
+    (batch,) = assign_all(ledger)
+    assert (len(batch.items), ledger.demand()) == (6, 3)
+    ledger.receive(worker, batch.seq, 0, 2, 0.0, kept=2)
+    assert ledger.demand() == 2
+
+
+def test_demand_counts_no_task_whose_time_is_over() -> None:
+    ledger, _ = ledger_with(1)
+    job_of(ledger, ["a", "b"], unit=2, alone=True)
+    (batch,) = assign_all(ledger)
+    assert ledger.demand() == 2
+    ledger.expire(batch.seq)
+    assert ledger.demand() == 1
+
+
 def test_demand_counts_no_tasks_that_wait_until_results_are_read() -> None:
     ledger, _ = ledger_with(2)
     job = job_of(ledger, range(10), pace=known(2 * SLOW))

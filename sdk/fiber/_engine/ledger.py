@@ -42,10 +42,7 @@ from fiber._engine.tasks import (
 )
 
 LOOKAHEAD = 4
-"""Number of jobs, waiting for an idle worker, that an assignment may pass over.
-
-A later job may then queue a batch at a busy worker.
-"""
+"""Number of jobs that wait for an idle worker while a later job queues a batch at a busy one."""
 
 _by_seq = attrgetter("seq")
 
@@ -61,12 +58,11 @@ class Ledger:
         self.workers: set[WorkerEntry] = set()
         self.batches: dict[int, Batch] = {}
         self.starting = 0
-        self.leased = 0
-        """Number of workers that callers lease."""
+        self.leased = 0  # number of workers that callers lease
         self._open_tasks = 0  # number of tasks of ``jobs`` that are fed and not done
         self._seq = itertools.count(1)
         self._turns: deque[Job] = deque()
-        self._paused: set[Job] = set()
+        self._with_surplus: set[Job] = set()  # those of ``jobs`` that are paused or have chunks
         self._load = WorkersByLoad()
         self._pins: dict[WorkerEntry, None] = {}
         self._unassigned_pins: list[tuple[Job, Span]] = []
@@ -92,7 +88,7 @@ class Ledger:
         one by one, and the worker notes each task that it begins.
         """
         job = Job(owner, pace or TaskPace(), limits, unit, alone, eager)
-        self.jobs.add(job)
+        self._list(job)
         return job
 
     def feed(self, job: Job, items: Sequence[Any]) -> None:
@@ -107,10 +103,7 @@ class Ledger:
         self._give_turn(job)
 
     def pin(self, job: Job, worker: WorkerEntry | None, item: Any) -> None:
-        """Add a task to ``job`` for this worker alone; None: for a later worker.
-
-        If the worker is lost, a later worker gets the task.
-        """
+        """Add a task to ``job`` for this worker alone; for a later worker if it is None or lost."""
         span = Span(job.fed, [item], alone=True, pin=True)
         self._add_fed(job, 1)
         if worker is None:
@@ -144,7 +137,7 @@ class Ledger:
         job.waiting = WaitingTasks()
         if job in self.jobs:
             self.jobs.discard(job)
-            self._paused.discard(job)
+            self._with_surplus.discard(job)
             self._open_tasks -= job.fed - job.done
         holders = []
         for batch in job.batches:
@@ -166,12 +159,10 @@ class Ledger:
     def pause(self, job: Job, paused: bool) -> None:
         """Hold back the tasks of a job that no worker has had yet; or end the pause."""
         job.paused = paused
-        if not paused:
-            self._paused.discard(job)
-            if job.waiting:
-                self._give_turn(job)
-        elif job in self.jobs:
-            self._paused.add(job)
+        if job in self.jobs:
+            self._list(job)
+        if not paused and job.waiting:
+            self._give_turn(job)
 
     # Workers
 
@@ -238,12 +229,13 @@ class Ledger:
         return next(iter(self._load.idle), None)
 
     def demand(self) -> int:
-        """Return how many tasks run or wait for a worker, without those that a pause holds back.
+        """Return how many workers the tasks could use that run or wait.
 
-        A cancelled batch that a worker still has counts as one.
+        The tasks of a chunk that the user asked for count as one, and tasks that a pause holds back
+        as none.  A cancelled batch that a worker still has counts as one.
         """
-        held_back = sum([job.never_given for job in self._paused]) if self._paused else 0
-        return self._open_tasks - held_back + len(self._cancelled)
+        surplus = sum([job.surplus for job in self._with_surplus]) if self._with_surplus else 0
+        return self._open_tasks - surplus + len(self._cancelled)
 
     def has_assignable(self) -> bool:
         """Return True if a worker may get a task."""
@@ -324,8 +316,7 @@ class Ledger:
         worker = batch.worker
         self.batches[batch.seq] = batch
         if batch.job is not None:
-            batch.job.batches[batch] = None
-            batch.job.reached = max(batch.job.reached, batch.stop)
+            batch.job.hold(batch)
         if not worker.queue:
             worker.since = now
         worker.queue.append(batch)
@@ -447,7 +438,7 @@ class Ledger:
         batch.worker.ended_seqs.append(batch.seq)
         self._cancelled.discard(batch)
         if batch.job is not None:
-            batch.job.batches.pop(batch, None)
+            batch.job.release(batch)
 
     def retry(self, receipt: Receipt, index: int) -> bool:
         """Run a task again because of its result; return False if it has no tries left."""
@@ -457,7 +448,7 @@ class Ledger:
         if not job.charges.charge(index):
             return False
         if job not in self.jobs:  # the job was finished by this task
-            self.jobs.add(job)
+            self._list(job)
             self._open_tasks += job.fed - job.done
         self._add_done(job, -1)
         span = Span(index, [receipt.item(index)], True, receipt.batch.pin)
@@ -512,7 +503,7 @@ class Ledger:
         job, batch.job = batch.job, None
         if job is None:
             return None
-        job.batches.pop(batch, None)
+        job.release(batch)
         self._add_done(job, 1)
         self._drop_if_finished(job)
         return Receipt(job, batch.start, 1, batch)
@@ -596,5 +587,12 @@ class Ledger:
     def _drop_if_finished(self, job: Job) -> bool:
         if job.finished:
             self.jobs.discard(job)
-            self._paused.discard(job)
+            self._with_surplus.discard(job)
         return job.finished
+
+    def _list(self, job: Job) -> None:
+        self.jobs.add(job)
+        if job.paused or job.unit > 1:
+            self._with_surplus.add(job)
+        else:
+            self._with_surplus.discard(job)

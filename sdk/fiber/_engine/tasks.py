@@ -172,6 +172,10 @@ class WaitingTasks:
         """Return whether the next task travels alone."""
         return self._stocks[0].alone
 
+    def chunks(self, unit: int) -> int:
+        """Return how many workers could run the tasks at once, if ``unit`` tasks stay together."""
+        return sum([len(each) if each.alone else -(-len(each) // unit) for each in self._stocks])
+
     def append(self, span: Span) -> None:
         """Add tasks behind all others."""
         self._count += len(span.items)
@@ -208,12 +212,14 @@ class Job:
         "done",
         "eager",
         "fed",
+        "held",
         "listed",
         "owner",
         "pace",
         "paused",
         "pins",
         "reached",
+        "running",
         "unit",
         "waiting",
     )
@@ -228,6 +234,8 @@ class Job:
         self.alone = alone or limits.retries == 0
         self.waiting = WaitingTasks()
         self.batches: dict[Batch, None] = {}  # batches of it that workers have
+        self.held = 0  # units of those batches
+        self.running = 0  # tasks of those batches without a result
         self.pins: dict[WorkerEntry, None] = {}  # workers that have pinned tasks of it
         self.charges = Charges(limits)
         self.fed = 0
@@ -248,10 +256,28 @@ class Job:
         waiting = self.waiting
         return bool(waiting) and not (self.paused and waiting.first() >= self.reached)
 
+    def hold(self, batch: Batch) -> None:
+        """Note that a worker has the batch."""
+        self.batches[batch] = None
+        self.held += batch.units
+        self.running += len(batch.items)
+        self.reached = max(self.reached, batch.stop)
+
+    def release(self, batch: Batch) -> None:
+        """Note that the batch is over."""
+        if batch in self.batches:
+            del self.batches[batch]
+            self.held -= batch.units
+            self.running -= len(batch.items) - batch.received
+
     @property
-    def never_given(self) -> int:
-        """Number of the job's tasks that were never given out."""
-        return self.fed - self.reached
+    def surplus(self) -> int:
+        """Number of open tasks that call for no further worker: the other tasks of each chunk, and
+        tasks that a pause holds back."""
+        surplus = max(0, self.running - self.held)
+        if self.paused:
+            return surplus + self.fed - self.reached
+        return surplus + len(self.waiting) - self.waiting.chunks(self.unit)
 
     @property
     def finished(self) -> bool:
@@ -343,6 +369,8 @@ class Batch:
         if kept is not None and not max(stop, 1) <= kept <= size:
             raise WrongAnswer(f"it kept {kept} of {size} tasks of batch {self.seq}, {stop} done")
         self._received_from, self.received = offset, stop
+        if self.job is not None:
+            self.job.running -= count
         return True
 
     @property
@@ -365,8 +393,11 @@ class Batch:
 
     def cut(self, kept: int) -> Span:
         """Keep only the first ``kept`` tasks; return the others."""
-        rest = self.part(self.start + kept, self.stop)
+        rest, units = self.part(self.start + kept, self.stop), self.units
         self.items = self.items[:kept]
+        if self.job is not None:
+            self.job.held -= units - self.units
+            self.job.running -= len(rest.items)
         return rest
 
     def suspects(self, running: RunningTask | None) -> range:
