@@ -50,9 +50,10 @@ def _add_images(commands: _Commands) -> None:
     ahead.set_defaults(run=lambda _: preparation.prepare())
     ours = commands.add_parser("images", help="build Fiber's images where their inputs changed")
     ours.set_defaults(run=lambda _: print(*images.build_images().values(), sep="\n"))
-    one = commands.add_parser("bring", help="build the image of an example, and import it as well")
-    one.add_argument("name", choices=[images.SEARCH.name])
-    one.set_defaults(run=lambda _: print(images.bring(images.SEARCH)))
+    one = commands.add_parser("bring", help="build an image on the worker's, and import it as well")
+    on_worker = {image.name: image for image in (images.SEARCH, images.PUBLISHED)}
+    one.add_argument("name", choices=on_worker)
+    one.set_defaults(run=lambda given: print(images.bring(on_worker[given.name])))
     load = commands.add_parser("load", help="import an archive of images into every node")
     load.add_argument("archive", type=Path)
     load.set_defaults(run=lambda given: images.load(given.archive))

@@ -108,6 +108,13 @@ WORKER_RL = Image(
 IMAGES = (OPERATOR, WORKER, WORKER_RL)
 SEARCH = Image("fiber-search", "examples/05-search/Dockerfile", (VERSION_FILE,), made_from=WORKER)
 """Image that a user builds from the worker's: only the tests that need it build it."""
+PUBLISHED = Image(
+    "fiber-published",
+    "tests/published/Dockerfile",
+    ("tests/published/requirements.txt", VERSION_FILE),
+    made_from=WORKER,
+)
+"""Image with the packages of the published programs."""
 
 
 def _is_cache(file: Path) -> bool:
