@@ -109,7 +109,7 @@ class Hosts:
 def objects_kept(hub: Hub) -> int:
     """Return how many objects it keeps, once it has done all earlier requests."""
     done = threading.Event()
-    hub._loop.call_soon(done.set)
+    hub.loop.call_soon(done.set)
     assert done.wait(PATIENCE)
     return len(hub.registry._objects)
 

@@ -22,6 +22,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar, cast
 
 from fiber._hub import shared_blocks
 from fiber._hub.local import LocalCounter
+from fiber._hub.protocol import Breach
+from fiber._hub.shared_blocks import RemoteWaitList
 from fiber._sync.semaphore import COUNTING, RECURSIVE, SEM_VALUE_MAX, Abandoned
 
 if TYPE_CHECKING:
@@ -289,23 +291,39 @@ class Barrier(threading.Barrier):
 
     def wait(self, timeout: float | None = None) -> int:
         """Wait for the others; return a different number from 0 to ``parties`` - 1 to each."""
+        timeout = self._timeout if timeout is None else timeout
+        if isinstance(self._members, RemoteWaitList):
+            return self._meet(self._members, timeout)
         with self._cond as acquired:
             if isinstance(acquired, Abandoned):  # its process died in this method
                 self._bury()
                 self._break()
             self._join()
             self._enter()
-            index = self._count
             self._change_count(1)
             try:
-                if index + 1 == self._parties:
+                if self._count == self._parties:
                     self._release()
                 else:
-                    self._wait(self._timeout if timeout is None else timeout)
+                    self._wait(timeout)
             finally:
                 self._change_count(-1)
+                # Also after a thread was interrupted, no two threads leave with the same count.
+                index = self._count
                 self._exit()
         return index
+
+    def _meet(self, members: RemoteWaitList, timeout: float | None) -> int:
+        """Let the hub of the barrier's host take the steps of ``wait``."""
+        if self._member != os.getpid():
+            self._member = os.getpid()
+            weakref.finalize(self, members.dismiss_all)
+        condition: Any = self._cond._waiters
+        lock: Any = self._cond._lock._semlock
+        met = members.meet(condition, lock, self._parties, self._action, timeout)
+        if isinstance(met, Breach):
+            raise threading.BrokenBarrierError(*_reason(met, timeout))
+        return met
 
     def reset(self) -> None:
         """Return to the initial state; waiters get BrokenBarrierError."""
@@ -340,11 +358,8 @@ class Barrier(threading.Barrier):
             lost = self._bury()
             if self._state == _FILLING and (lost or left <= RECHECK):
                 self._break()
-                raise threading.BrokenBarrierError(
-                    "a process that took part has died"
-                    if lost
-                    else f"the others did not come in {timeout} s"
-                )
+                breach = Breach.DIED if lost else Breach.LATE
+                raise threading.BrokenBarrierError(*_reason(breach, timeout))
         if self._state < 0:
             raise threading.BrokenBarrierError
 
@@ -375,6 +390,12 @@ class Barrier(threading.Barrier):
         def _break(self) -> None: ...
         def _release(self) -> None: ...
         def _exit(self) -> None: ...
+
+
+def _reason(breach: Breach, timeout: float | None) -> list[str]:
+    if breach is Breach.DIED:
+        return ["a process that took part has died"]
+    return [f"the others did not come in {timeout} s"] if breach is Breach.LATE else []
 
 
 _FILLING, _DRAINING, _RESETTING = 0, 1, -1  # states of threading's barrier

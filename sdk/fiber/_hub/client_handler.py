@@ -19,6 +19,7 @@ from fiber._hub.hosted import (
     HostedWaitList,
     Parts,
 )
+from fiber._hub.parties import Party, new_party
 from fiber._hub.protocol import (
     FOUR,
     GRANTING,
@@ -38,6 +39,7 @@ from fiber._hub.protocol import (
 from fiber._hub.registry import Hosted, NoSuchObject, ObjectAttachment, Registry
 from fiber._hub.replicas import BlockIdentity, Replicas
 from fiber._hub.streams import NullHandler, Stream
+from fiber._transport.loop import Loop
 from fiber._wire import bundle
 from fiber._wire.packet import Message
 
@@ -55,6 +57,7 @@ class HandlerHub(Protocol):
     registry: Registry
     doorbell: Doorbell
     replicas: Replicas
+    loop: Loop
 
     def connect(self, host: str, stream: Stream) -> None:
         """Connect ``stream`` to the hub of ``host``."""
@@ -117,6 +120,8 @@ class ClientHandler:
         """Number of the last request that got a token, while the client may still give it up."""
         self._place: int | None = None
         """Place of the client in the wait list of a condition."""
+        self._party: Party | None = None
+        """Part of the client in a barrier."""
         self._claimed = False
         """True if the counter was lowered for this client, which has not confirmed that."""
         stream.handler = self
@@ -131,10 +136,8 @@ class ClientHandler:
                 if self._claimed and operation not in (Op.KEEP, Op.CANCEL):
                     self._unclaim()
                 _OPERATIONS[operation](self, message)
-        except RequestRefused as refusal:
+        except (RequestRefused, NoSuchObject) as refusal:
             self._end(str(refusal))
-        except NoSuchObject as error:
-            self._end(str(error))
         except (struct.error, ValueError, IndexError, KeyError, OSError) as error:
             # A malformed request, or a system without a free descriptor.
             self._end(f"the hub could not carry out the request: {error}")
@@ -162,6 +165,9 @@ class ClientHandler:
         self.stream.finish(reason)
 
     def _leave(self) -> None:
+        party, self._party = self._party, None
+        if party is not None:
+            party.abandon()
         self._cancel()
         self._give_back()
         self._unclaim()
@@ -180,14 +186,13 @@ class ClientHandler:
         self._bound.clear()
         self._home.ended(self)
 
-    def _cancel(self) -> PendingRequest | None:
-        """Withdraw and return the request that waits."""
+    def _cancel(self) -> None:
+        """Withdraw the request that waits."""
         request, self.waiting = self.waiting, None
         if request is not None and self._hosted is not None:
             self._hosted.withdraw(request)
             if request.on_withdrawal is not None:
                 request.on_withdrawal()
-        return request
 
     def _request(
         self, message: Message, granted: Callable[[], None] | None = None
@@ -293,10 +298,9 @@ class ClientHandler:
 
     def cancel(self, message: Message) -> None:
         """Reply NO to the request that waits."""
-        number = HEAD.unpack_from(message.payload)[1]
-        if self.waiting is not None and self.waiting.number == number:
-            request = self._cancel()
-            assert request is not None
+        request = self.waiting
+        if request is not None and request.number == HEAD.unpack_from(message.payload)[1]:
+            self._cancel()
             request.answer(Status.NO)
 
     def sync(self, message: Message) -> None:
@@ -309,7 +313,8 @@ class ClientHandler:
         elif ONE.unpack(message.payload)[2] == self._last_token_request:
             self._semaphore().release()
         self._last_token_request = None
-        self._request(message).answer(Status.OK)
+        reply = partial(self._request(message).answer, Status.OK)
+        reply() if self._party is None else self._party.withdraw(reply)
 
     # A channel
 
@@ -443,7 +448,7 @@ class ClientHandler:
 
     def acquire(self, message: Message) -> None:
         """Take a token, which the stream keeps."""
-        holder = bytes(message.buffers[0][:_NAME_BYTES]).decode(errors="replace")
+        holder = _name_in(message)
         request = self._request(message)
         self._semaphore().acquire(request, partial(self._token_taken, holder, request.number))
 
@@ -501,9 +506,12 @@ class ClientHandler:
 
     def leave(self, message: Message) -> None:
         """Free the place."""
+        request = self._request(message)
+        if self._party is not None:
+            self._party.dismiss()
         place, self._place = self._place, None
         notified = place is not None and self._wait_list().places.leave(place)
-        self._request(message).answer(Status.OK if notified else Status.NO)
+        request.answer(Status.OK if notified else Status.NO)
 
     def notify(self, message: Message) -> None:
         """Wake some waiters."""
@@ -523,7 +531,7 @@ class ClientHandler:
         self._wait_list().places.hold(self._own_place(), ONE.unpack(message.payload)[2])
 
     def held(self, message: Message) -> None:
-        """Reply with the number of things that the processes of all places have."""
+        """Reply with the number of things of all processes."""
         self._request(message).answer(Status.OK, self._wait_list().places.held())
 
     def reclaim(self, message: Message) -> None:
@@ -542,8 +550,30 @@ class ClientHandler:
         self._wait_list().places.set(number & 1, value - (1 << 64) if value >> 63 else value)
         self._request(message).answer(Status.OK)
 
+    # A barrier
+
+    def meet(self, message: Message) -> None:
+        """Wait at the barrier of which this wait list has the members."""
+        _, _, *tokens, parties, acts, timeout = protocol.MEETING.unpack(message.payload)
+        if self._party is None:
+            home, members = self._home, self._wait_list()
+            self._party = new_party(home.loop, home.registry, members, *tokens)
+        request, party = self._request(message), self._party
+        request.on_withdrawal = party.withdraw
+        party.meet(request, parties, protocol.seconds(timeout), _name_in(message) if acts else "")
+
+    def acted(self, message: Message) -> None:
+        """Let all threads at the barrier go: the client has called the action."""
+        if self._party is None:
+            raise RequestRefused("the stream has no part in a barrier")
+        self._party.acted(self._request(message))
+
 
 _WORD = (1 << 64) - 1
+
+
+def _name_in(message: Message) -> str:
+    return bytes(message.buffers[0][:_NAME_BYTES]).decode(errors="replace")
 
 
 class _Joining:

@@ -306,6 +306,7 @@ class HostedSemaphore:
         self._semaphore = SharedSemaphore(block, COUNTING)
         self._waiters: deque[tuple[Waiter, Callable[[bool], None]]] = deque()
         self._is_listening = False
+        self._is_serving = False
         self._revival = threading.Thread()  # none yet
 
     def acquire(self, waiter: Waiter, granted: Callable[[bool], None]) -> None:
@@ -315,11 +316,20 @@ class HostedSemaphore:
         """
         self._waiters.append((waiter, granted))
         self._serve()
-        if self._waiters and not self._is_listening:
-            self._is_listening = True
-            self._doorbell.listen(self._serve)
-            self._semaphore.listen(True)
-            self._look()
+
+    def lend(self, action: Callable[[], bool]) -> None:
+        """Call ``action`` with a token that a waiter got, and return the token unless it is True.
+
+        Other waiters are served after that.
+        """
+        keeps = False
+        before, self._is_serving = self._is_serving, True
+        try:
+            keeps = action()
+        finally:
+            self._is_serving = before
+            if not keeps:
+                self.release()
 
     def release(self) -> None:
         """Return a token; ValueError if the semaphore is at its maximum."""
@@ -357,6 +367,20 @@ class HostedSemaphore:
         self._stop_listening()
 
     def _serve(self) -> None:
+        if self._is_serving:  # by a caller of this call, which goes on
+            return
+        self._is_serving = True
+        try:
+            self._serve_waiters()
+        finally:
+            self._is_serving = False
+        if self._waiters and not self._is_listening:
+            self._is_listening = True
+            self._doorbell.listen(self._serve)
+            self._semaphore.listen(True)
+            self._look()
+
+    def _serve_waiters(self) -> None:
         while self._waiters and (result := self._semaphore.try_acquire()):
             waiter, granted = self._waiters.popleft()
             tracked = not self._semaphore.is_untracked()
@@ -423,7 +447,8 @@ class HostedWaitList:
 
     def _serve(self) -> None:
         for waiter, place in list(self._sleepers.items()):
-            if self.places.is_notified(place):
+            # A waiter that was answered may have served others.
+            if waiter in self._sleepers and self.places.is_notified(place):
                 del self._sleepers[waiter]
                 waiter.answer(Status.OK)
         if not self._sleepers:

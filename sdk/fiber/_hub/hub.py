@@ -69,7 +69,7 @@ class Hub:
         """``directory``: the one to make for the socket, else one with a new name in ``parent``."""
         self.host = host
         self.key = secrets.token_bytes(protocol.KEY_BYTES)
-        self._loop = loop
+        self.loop = loop
         self._parent = parent
         self._directory = directory
         self._poller = Poller(loop)
@@ -118,21 +118,21 @@ class Hub:
 
     def on_loop(self) -> bool:
         """Tell whether the caller runs on the thread that serves this hub."""
-        return self._loop.on_thread()
+        return self.loop.on_thread()
 
     def dial(self) -> socket.socket:
         """Return the socket of a new stream from this process to its hub.  Any thread."""
         ours, theirs = socketpair("using a pipe or queue of another host")
-        self._loop.call_soon(self._admit, theirs)
+        self.loop.call_soon(self._admit, theirs)
         return without_timeout(QuietSocket(fileno=ours.detach()))
 
     def fetch(self, grant: bytes) -> list[Descriptor]:
         """Return an object's descriptors for this process.  Any thread; waits for the loop."""
-        if self._loop.on_thread():
+        if self.loop.on_thread():
             return list(map(own, self.registry.fetch(grant)))
         answers: SimpleQueue[list[Descriptor] | Exception] = SimpleQueue()
-        self._loop.call_soon(self._answer, grant, answers)
-        while not self._closed and not self._loop.broken:
+        self.loop.call_soon(self._answer, grant, answers)
+        while not self._closed and not self.loop.broken:
             try:
                 answer = answers.get(timeout=DOZE)
             except Empty:
@@ -153,7 +153,7 @@ class Hub:
 
         None stands for every host without a link here, as for an agent's link to the master.
         """
-        link = HubLink(self._loop.call_soon, send)
+        link = HubLink(self.loop.call_soon, send)
         link.memory = self.replicas.link(host, send, dialer=dialer)
         link.tunnels = self._router.link(host, link.send, dialer=dialer)
         return link
@@ -183,7 +183,7 @@ class Hub:
         self.registry.close()
         for _, listener in self._opened[:1]:
             if listener is not None:
-                self._loop.unregister(listener.fileno())
+                self.loop.unregister(listener.fileno())
                 listener.close()
         self._poller.close()
         if self.directory is not None:
@@ -201,12 +201,12 @@ class Hub:
             return
         opened = HubAddress(self.host, path, self.key), listener
         try:
-            self._loop.register(listener.fileno(), partial(self._accept_socket, listener))
+            self.loop.register(listener.fileno(), partial(self._accept_socket, listener))
             self._opened.append(opened)
         finally:
             if not self._opened or self._opened[0] is not opened:
                 # Another thread, or a handler that interrupted this one, was faster.
-                self._loop.unregister(listener.fileno())
+                self.loop.unregister(listener.fileno())
                 listener.close()
                 remove_directory(os.path.dirname(path))
 
@@ -219,8 +219,8 @@ class Hub:
             if error.errno not in (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM):
                 raise
             # The client still waits.  Without this pause the loop would spin.
-            self._loop.unregister(listener.fileno())
-            self._loop.call_later(_ACCEPT_AGAIN, self._listen_again, listener)
+            self.loop.unregister(listener.fileno())
+            self.loop.call_later(_ACCEPT_AGAIN, self._listen_again, listener)
             return
         _, uid, _ = _PEER.unpack(sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size))
         if uid in (os.geteuid(), 0):
@@ -230,7 +230,7 @@ class Hub:
 
     def _listen_again(self, listener: socket.socket) -> None:
         if listener.fileno() >= 0:
-            self._loop.register(listener.fileno(), partial(self._accept_socket, listener))
+            self.loop.register(listener.fileno(), partial(self._accept_socket, listener))
 
     def _admit(self, sock: socket.socket) -> None:
         stream = SocketStream(self._poller, sock)
@@ -252,12 +252,12 @@ class Hub:
             (segment,) = beside
             end = ENDS[shared.kind](fd, Backlog(block_of(segment, *shared.extent)))
             if isinstance(end, ReceivingEnd):
-                return HostedReceiver(self._loop, self._poller, end)
+                return HostedReceiver(self.loop, self._poller, end)
             return HostedChannel(self._poller, end)
         if shared.kind is ObjectKind.SEMAPHORE:
-            return HostedSemaphore(self._loop, self.doorbell, block_of(fd, *shared.extent))
+            return HostedSemaphore(self.loop, self.doorbell, block_of(fd, *shared.extent))
         if shared.kind is ObjectKind.WAIT_LIST:
-            return HostedWaitList(self._loop, self.doorbell, block_of(fd, *shared.extent))
+            return HostedWaitList(self.loop, self.doorbell, block_of(fd, *shared.extent))
         return HostedCounter(self._poller, LocalCounter(fd))
 
 

@@ -16,12 +16,13 @@ A process that changed shared memory rings the doorbell, and the hub looks at th
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable
 from enum import IntEnum, IntFlag
 from typing import NamedTuple
 
-VERSION = 6
+VERSION = 7
 KEY_BYTES = 32
 
 SECRET_BYTES = 16
@@ -125,6 +126,10 @@ class Op(IntEnum):
     HOLD = 58  # number of things of the stream's process; silent
     RECLAIM = 59  # token of a counter, which is raised by -> number of things of dead processes
     HELD = 61  # -> number of things of all processes
+    # For the members of a barrier
+    MEET = 62  # tokens of condition and lock, parties, 1 if there is an action, microseconds or
+    # ENDLESS; name of the process beside it -> index; or BROKEN, and why; or ACT, and the process
+    ACTED = 63  # has called the action -> index
 
 
 class Status(IntEnum):
@@ -136,6 +141,19 @@ class Status(IntEnum):
     BROKEN = 3
     READY = 4  # sent to a watching stream; replies to no request
     GONE = 5  # the stream ends; the reason follows
+    ACT = 6  # the client has to call the action of the barrier, whose lock its stream keeps
+
+
+class Breach(IntEnum):
+    """Reason why a wait at a barrier ends with BROKEN."""
+
+    BEFORE = 0  # another thread broke it
+    DIED = 1  # a process that took part has died
+    LATE = 2  # the others did not come in time
+
+
+ENDLESS = (1 << 64) - 1
+"""Timeout that never ends, in microseconds."""
 
 
 class Origin(NamedTuple):
@@ -178,6 +196,7 @@ ONE = struct.Struct("<BIQ")
 SECRET = struct.Struct(f"<BI{_SECRET}")
 SECRETS = struct.Struct(f"<BI{_SECRET}{_SECRET}")
 GRANTING = struct.Struct(f"<BIQ{_SECRET}")
+MEETING = struct.Struct(f"<BI{_SECRET}{_SECRET}QQQ")
 
 
 def hello(key: bytes) -> bytes:
@@ -188,6 +207,17 @@ def hello(key: bytes) -> bytes:
 def connect(host: str) -> bytes:
     """Return the message that connects a stream to the hub of ``host``."""
     return HEAD.pack(Op.CONNECT, 0) + host.encode()
+
+
+def microseconds(timeout: float | None) -> int:
+    """Return a timeout in seconds as MEET has it."""
+    within = ENDLESS if timeout is None else max(0.0, timeout) * 1e6
+    return ENDLESS if within >= ENDLESS else math.ceil(within)
+
+
+def seconds(within: int) -> float:
+    """Return the timeout of a MEET request."""
+    return math.inf if within == ENDLESS else within / 1e6
 
 
 def gone(reason: str) -> bytes:

@@ -15,12 +15,13 @@ import copyreg
 import os
 import threading
 import weakref
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from multiprocessing import current_process
 from typing import Any, TypeAlias
 
 from fiber._hub import client, heap
-from fiber._hub.client import HubStream, ObjectUnreachable
+from fiber._hub.client import HubStream, ObjectUnreachable, Reply
 from fiber._hub.handles import (
     BlockHandle,
     HubHandle,
@@ -29,7 +30,20 @@ from fiber._hub.handles import (
     ring_doorbell,
 )
 from fiber._hub.heap import Block, block_of
-from fiber._hub.protocol import ONE, SECRET, TWO, Extent, ObjectKind, Op, Origin, Status
+from fiber._hub.protocol import (
+    ENDLESS,
+    MEETING,
+    ONE,
+    SECRET,
+    TWO,
+    Breach,
+    Extent,
+    ObjectKind,
+    Op,
+    Origin,
+    Status,
+    microseconds,
+)
 from fiber._hub.remote import RemoteCounter, RemoteObject
 from fiber._sync.semaphore import RECURSIVE, SEMAPHORE_SIZE, Abandoned, SharedSemaphore
 from fiber._sync.wait_list import WAIT_LIST_SIZE, WaitList
@@ -162,6 +176,15 @@ class RemoteSemaphore(RemoteObject):
                 stream.say(Op.DISOWN)
             self._idle.append(stream)
 
+    @contextmanager
+    def kept_elsewhere(self) -> Iterator[None]:
+        """Let this thread acquire it again, as a stream of another object keeps its token."""
+        self._owner, self._depth = threading.get_ident(), 1
+        try:
+            yield
+        finally:
+            self._owner, self._depth = None, 0
+
     def _is_mine(self) -> bool:
         """Tell whether this thread holds it, and was the last of this process to acquire it."""
         return self._depth > 0 and self._owner == threading.get_ident()
@@ -197,7 +220,11 @@ class RemoteSemaphore(RemoteObject):
         self._owner, self._depth = None, 0
 
     def _name(self) -> str:
-        return f"{current_process().name} (pid {os.getpid()} on {client.host()})"
+        return _process_name()
+
+
+def _process_name() -> str:
+    return f"{current_process().name} (pid {os.getpid()} on {client.host()})"
 
 
 AnySemaphore: TypeAlias = SharedSemaphore | RemoteSemaphore
@@ -301,11 +328,6 @@ class RemoteWaitList(RemoteObject):
         """Note how many things the process at ``place`` has.  Never waits."""
         place.say(Op.HOLD, number, form=ONE)
 
-    def tally(self, place: HubStream, held: int, total: int) -> None:
-        """Note how many things the process at ``place`` has, and set the user's second word."""
-        self.hold(place, held)
-        place.ask(Op.SET, 1, total, form=TWO)
-
     def held(self) -> int:
         """Return the number of things that the processes of all places have."""
         return self._ask(Op.HELD, 0)
@@ -326,10 +348,62 @@ class RemoteWaitList(RemoteObject):
         with self.stream() as stream:
             stream.ask(Op.SET, number, value & ((1 << 64) - 1), form=TWO)
 
+    def meet(
+        self,
+        condition: RemoteWaitList,
+        lock: RemoteSemaphore,
+        parties: int,
+        action: Callable[[], object] | None,
+        timeout: float | None,
+    ) -> int | Breach:
+        """Wait at the barrier of which this wait list has the members; return the index.
+
+        The hub takes all steps, and this process calls the action.
+        """
+        known = condition.known(), lock.known()
+        acts, within = action is not None, microseconds(timeout)
+        name = [memoryview(_process_name().encode())] if acts else []
+        with self._interruptible() as stream:
+            numbers = min(parties, ENDLESS), acts, within
+            reply = stream.ask(Op.MEET, *known, *numbers, form=MEETING, buffers=name)
+            if reply.status is Status.ACT:
+                assert action is not None
+                with lock.kept_elsewhere():
+                    action()
+                reply = stream.ask(Op.ACTED)
+        return _index_or_breach(reply)
+
+    @contextmanager
+    def _interruptible(self) -> Iterator[HubStream]:
+        """Yield a stream; after an error the hub undoes what the last request began."""
+        with self.stream() as stream:
+            try:
+                yield stream
+            except ObjectUnreachable:
+                raise
+            except BaseException:
+                with suppress(OSError, ObjectUnreachable):
+                    stream.give_up()
+                    stream.settle()
+                raise
+
+    def dismiss_all(self) -> None:
+        """Free the places of all streams, as this process ends in good order.  Never waits."""
+        for stream in tuple(self._streams):
+            with suppress(OSError, ObjectUnreachable):
+                stream.say(Op.LEAVE)
+
     def _ask(self, operation: Op, number: int) -> int:
         with self.stream() as stream:
             value: int = stream.ask(operation, number, form=ONE).values[0]
         return value
+
+
+def _index_or_breach(reply: Reply) -> int | Breach:
+    if reply.status is Status.NO:
+        raise OSError("more than a thousand threads wait at one barrier")
+    (value,) = reply.values
+    return value if reply.status is Status.OK else Breach(value)
 
 
 AnyWaitList: TypeAlias = WaitList | RemoteWaitList
