@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import threading
 from typing import Any
 
 import numpy as np
@@ -19,8 +20,10 @@ from fiber._hub.handles import collecting_grants
 from fiber._hub.local import LocalChannel, LocalCounter
 from fiber._hub.remote import RemoteCounter
 from fiber._hub.streams import WINDOW
+from fiber._transport.channels import wait_readable
 from fiber.connection import Connection, wait
-from hosts import Far, Hosts, background, objects_kept
+from fiber.errors import ConnectionClosed
+from hosts import Far, Hosts, Wire, background, objects_kept
 from patience import PATIENCE
 
 # Channels
@@ -66,6 +69,102 @@ def test_an_interrupted_confirmation_is_not_waited_for_again(
     there._send_unconfirmed(3)
     there.send(4)
     assert [here.recv() for _ in range(3)] == [1, 3, 4]
+
+
+def exchange_on_thread(there: Connection, payload: bytes, results: list[Any]) -> threading.Thread:
+    """Begin an exchange, whose message or error goes to ``results``."""
+
+    def exchange() -> None:
+        try:
+            results.append(there._channel.exchange(payload).tobytes())  # type: ignore[union-attr]
+        except (OSError, EOFError) as error:
+            results.append(type(error))
+
+    return background(exchange)
+
+
+def test_an_exchange_is_one_request(
+    far_pipe: tuple[Connection, Connection], wires: tuple[Wire, Wire]
+) -> None:
+    here, there = far_pipe
+    there.send_bytes(b"first")  # from here on the stream is open
+    assert here.recv_bytes() == b"first"
+    up, down = wires
+    before = up.frames, down.frames
+    results: list[Any] = []
+    thread = exchange_on_thread(there, b"question", results)
+    assert here.recv_bytes() == b"question"
+    here.send_bytes(b"answer")
+    thread.join(PATIENCE)
+    assert results == [b"answer"]
+    assert (up.frames - before[0], down.frames - before[1]) == (1, 1)
+
+
+def test_an_exchange_waits_for_room_and_for_the_answer(
+    far_pipe: tuple[Connection, Connection],
+) -> None:
+    here, there = far_pipe
+    payload = bytes(30_000)
+    results: list[Any] = []
+    # Together they are more than the socket has room for.
+    threads = [exchange_on_thread(there, payload, results) for _ in range(50)]
+    for _ in threads:
+        assert here.recv_bytes() == payload
+    answers = [b"%d" % number for number in range(len(threads))]
+    for answer in answers:
+        here.send_bytes(answer)
+    for thread in threads:
+        thread.join(PATIENCE)
+    assert sorted(results) == sorted(answers)
+
+
+@pytest.mark.parametrize("reads", [True, False])
+def test_an_exchange_ends_with_the_other_end(
+    far_pipe: tuple[Connection, Connection], reads: bool
+) -> None:
+    here, there = far_pipe
+    results: list[Any] = []
+    if reads:
+        thread = exchange_on_thread(there, b"question", results)
+        assert here.recv_bytes() == b"question"
+        here.close()
+    else:
+        here.close()
+        thread = exchange_on_thread(there, b"question", results)
+    thread.join(PATIENCE)
+    assert results == [ConnectionClosed if reads else BrokenPipeError]
+
+
+def test_an_interrupted_exchange_loses_no_message(
+    far_pipe: tuple[Connection, Connection], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(stream: HubStream, *_: Any) -> None:
+        assert wait_readable(stream.fileno(), PATIENCE)
+        raise KeyboardInterrupt
+
+    here, there = far_pipe
+    channel = there._channel
+    assert channel is not None
+    here.send_bytes(b"1")
+    with monkeypatch.context() as ctrl_c:
+        ctrl_c.setattr(HubStream, "_reply", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            channel.exchange(b"a")
+    here.send_bytes(b"2")
+    assert channel.exchange(b"b").tobytes() == b"1"
+    assert channel.exchange(b"c").tobytes() == b"2"
+    assert [here.recv_bytes() for _ in range(3)] == [b"a", b"b", b"c"]
+
+
+def test_an_exchange_does_not_overtake_an_unconfirmed_message(
+    far_pipe: tuple[Connection, Connection],
+) -> None:
+    here, there = far_pipe
+    assert there._channel is not None
+    here.send_bytes(b"answer")
+    there._channel.send_unconfirmed(b"1")
+    assert there._channel.exchange(b"2").tobytes() == b"answer"
+    assert [here.recv_bytes() for _ in range(2)] == [b"1", b"2"]
 
 
 def test_threads_that_wait_do_not_wait_for_each_other(far: Far) -> None:

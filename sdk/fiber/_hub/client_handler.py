@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hmac
-import os
 import struct
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -11,7 +10,6 @@ from functools import partial
 from typing import Protocol
 
 from fiber._hub import protocol
-from fiber._hub.heap import Block
 from fiber._hub.hosted import (
     HostedChannel,
     HostedCounter,
@@ -37,7 +35,7 @@ from fiber._hub.protocol import (
     Status,
 )
 from fiber._hub.registry import Hosted, NoSuchObject, ObjectAttachment, Registry
-from fiber._hub.replicas import BlockIdentity, Replicas
+from fiber._hub.replicas import BlockIdentity, Joining, Replicas
 from fiber._hub.streams import NullHandler, Stream
 from fiber._transport.loop import Loop
 from fiber._wire import bundle
@@ -73,7 +71,7 @@ class RequestRefused(Exception):
 class PendingRequest:
     """Request that waits for its reply, which is sent once."""
 
-    __slots__ = ("_handler", "_number", "_on_ok", "on_withdrawal")
+    __slots__ = ("_handler", "_number", "_on_ok", "on_withdrawal", "then")
 
     def __init__(
         self, handler: ClientHandler, number: int, on_ok: Callable[[], None] | None = None
@@ -83,9 +81,15 @@ class PendingRequest:
         self._on_ok = on_ok
         self.on_withdrawal: Callable[[], None] | None = None
         """Function to call if the request ends without a reply."""
+        self.then: Callable[[], None] | None = None
+        """Second part of the request, which follows a first part that ends with OK."""
 
     def answer(self, status: Status, value: int = 0, buffers: Sequence[memoryview] = ()) -> None:
-        """Send the reply."""
+        """Send the reply, or go on with the second part."""
+        then, self.then = self.then, None
+        if then is not None and status is Status.OK:
+            then()
+            return
         if self._handler.waiting is self:
             self._handler.waiting = None
         if self._on_ok is not None and status is Status.OK:
@@ -294,7 +298,7 @@ class ClientHandler:
             raise RequestRefused("a stream can have one object only")
         origin = Origin.decode(message.buffers[0])
         self._joined = origin.block
-        self._home.replicas.join(origin, self, _Joining(self, number))
+        self._home.replicas.join(origin, self, Joining(self, number))
 
     def cancel(self, message: Message) -> None:
         """Reply NO to the request that waits."""
@@ -330,6 +334,13 @@ class ClientHandler:
             raise RequestRefused("there is no message to send")
         payload, *buffers = message.buffers
         self._channel().send(self._request(message), deque([(payload, buffers)]))
+
+    def exchange(self, message: Message) -> None:
+        """Send a message, then receive one."""
+        payload, *buffers = message.buffers
+        request, channel = self._request(message), self._channel()
+        request.then = partial(channel.receive, request)
+        channel.send(request, deque([(payload, buffers)]))
 
     def put_items(self, message: Message) -> None:
         """Count the messages of a bundle, reply, and send them.
@@ -574,23 +585,6 @@ _WORD = (1 << 64) - 1
 
 def _name_in(message: Message) -> str:
     return bytes(message.buffers[0][:_NAME_BYTES]).decode(errors="replace")
-
-
-class _Joining:
-    """Client's request for memory of another host; a ``Joiner``."""
-
-    def __init__(self, handler: ClientHandler, number: int) -> None:
-        self._handler = handler
-        self._number = number
-
-    def joined(self, block: Block) -> None:
-        """Reply with the block."""
-        reply = ONE.pack(Status.OK, self._number, block.offset)
-        self._handler.stream.send(reply, (), [os.dup(block.segment.fileno())])
-
-    def refused(self, reason: str) -> None:
-        """Close the stream, as there is no block to send."""
-        self._handler.close(reason)
 
 
 _OPERATIONS: dict[Op, Callable[[ClientHandler, Message], None]] = {

@@ -95,6 +95,7 @@ class Op(IntEnum):
     # For an attached channel
     SEND = 10  # payload and buffers beside it
     RECV = 11  # -> more; payload and buffers beside it
+    EXCHANGE = 12  # as SEND, then as RECV; BROKEN if it was not sent
     POLL = 13
     WATCH = 14  # silent; the stream gets READY once the channel is readable
     CHECK = 15  # NO if it is not readable now; then as WATCH

@@ -221,6 +221,17 @@ class RemoteChannel(RemoteObject):
         assert message is not None
         return message
 
+    def exchange(self, payload: bytes) -> Message:
+        """Send one message and return the next one, by one request.
+
+        BrokenPipeError or ConnectionClosed at the end.  The message may have been sent or not.
+        """
+        if self._unconfirmed:  # on other streams, which this message must not overtake
+            self._confirm()
+        message = self._receive(Op.EXCHANGE, buffers=[memoryview(payload)])
+        assert message is not None
+        return message
+
     def recv_object(self) -> Any:
         """Return the next message, unpickled."""
         return packet.loads(self.recv())
@@ -260,12 +271,16 @@ class RemoteChannel(RemoteObject):
         *values: bytes,
         form: struct.Struct = HEAD,
         timeout: float | None = None,
+        buffers: Sequence[memoryview] = (),
     ) -> Message | None:
         with self.stream() as stream:
             if self._late:
+                if buffers:
+                    _check_sent(stream.ask(Op.SEND, buffers=buffers))
                 reply = self._late.popleft()
             else:
-                reply = stream.ask(operation, *values, form=form, timeout=timeout)
+                reply = stream.ask(operation, *values, form=form, timeout=timeout, buffers=buffers)
+        _check_sent(reply)
         if reply.status is Status.EOF:
             raise ConnectionClosed()
         if reply.status is Status.NO:

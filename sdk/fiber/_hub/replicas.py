@@ -35,6 +35,7 @@ A patch is a sequence of extents::
 from __future__ import annotations
 
 import itertools
+import os
 import re
 import struct
 from collections import deque
@@ -44,8 +45,9 @@ from typing import NamedTuple, Protocol
 
 from fiber._hub import heap
 from fiber._hub.heap import Block, block_of
-from fiber._hub.protocol import ObjectKind, Origin
+from fiber._hub.protocol import ONE, ObjectKind, Origin, Status
 from fiber._hub.registry import NoSuchObject, Registry
+from fiber._hub.streams import Stream
 from fiber._wire.descriptor import own
 from fiber._wire.messages import MemoryMessage, ProtocolError
 
@@ -196,6 +198,35 @@ class Joiner(Protocol):
 
     def refused(self, reason: str) -> None:
         """Note that the block is not available."""
+
+
+class ReplyingHandler(Protocol):
+    """Handler of a stream that requests memory of another host.
+
+    ``ClientHandler`` implements it.  This module stands below ``client_handler``.
+    """
+
+    stream: Stream
+
+    def close(self, reason: str) -> None:
+        """End the stream."""
+
+
+class Joining:
+    """Client's request for memory of another host; a ``Joiner``."""
+
+    def __init__(self, handler: ReplyingHandler, number: int) -> None:
+        self._handler = handler
+        self._number = number
+
+    def joined(self, block: Block) -> None:
+        """Reply with the block."""
+        reply = ONE.pack(Status.OK, self._number, block.offset)
+        self._handler.stream.send(reply, (), [os.dup(block.segment.fileno())])
+
+    def refused(self, reason: str) -> None:
+        """Close the stream, as there is no block to send."""
+        self._handler.close(reason)
 
 
 class Replica:

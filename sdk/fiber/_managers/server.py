@@ -38,7 +38,7 @@ from fiber._managers.client import (
 )
 from fiber._transport.channels import Channel
 from fiber._wire import packet
-from fiber._wire.packet import Message
+from fiber._wire.packet import INLINE_LIMIT, Message
 from fiber.errors import ConnectionClosed
 
 _mp: Any = mp_managers  # typeshed has part of it
@@ -114,6 +114,11 @@ class ClientThread:
         it makes the next call.
         """
 
+    def begin_call(self) -> _Taken | None:
+        """Return the item that the last call has taken.  The next call has taken none yet."""
+        previous, self.taken = self.taken, None
+        return previous
+
 
 class Server(_mp.Server):  # type: ignore[misc]
     """Server of a manager's objects for the processes of the program."""
@@ -180,8 +185,9 @@ class Server(_mp.Server):  # type: ignore[misc]
         thread = ClientThread()
         try:
             channel.send(b"")
+            message = channel.recv()
             while True:
-                thread.kept = self._serve_call(client, thread, channel, channel.recv())
+                message = self._serve_call(client, thread, channel, message)
         except (OSError, ConnectionClosed):
             pass
         finally:
@@ -189,11 +195,12 @@ class Server(_mp.Server):  # type: ignore[misc]
 
     def _serve_call(
         self, client: Client, thread: ClientThread, channel: Channel, message: Message
-    ) -> Any:
+    ) -> Message:
+        """Make a call and send the answer; return the next message of the client."""
         (number,) = NUMBER.unpack_from(message.payload)
         message.payload = message.payload[NUMBER.size :]
         ident, method = None, ""
-        previous, thread.taken = thread.taken, None
+        previous = thread.begin_call()
         answer: _Answer
         try:
             ident, method, args, kwds = packet.loads(message)
@@ -206,14 +213,19 @@ class Server(_mp.Server):  # type: ignore[misc]
                 answer = self._call_server(client, method, args, kwds)
         except BaseException:
             answer = "#TRACEBACK", format_exc()
+        payload, buffers = _encoded(thread, number, answer)
+        ends = ident is None and method == "shutdown"
         try:
-            return _reply(channel, number, answer)
+            if thread.taken is None and not (ends or buffers) and len(payload) <= INLINE_LIMIT:
+                # On another host this is one request, which does not tell whether the answer came.
+                return channel.exchange(payload)
+            _send(channel, number, payload, buffers)
         except BrokenPipeError:  # the client has ended, or does not wait for the answer
             _put_back(thread.taken)
-            return None
         finally:
-            if ident is None and method == "shutdown":
+            if ends:
                 self.stop_event.set()
+        return channel.recv()
 
     def _call_server(self, client: Client, method: str, args: Any, kwds: Any) -> _Answer:
         if method not in self.public:
@@ -341,14 +353,24 @@ def _error_answer(error: BaseException) -> _Answer:
     return ("#ERROR", pickled) if pickled.whole else ("#TRACEBACK", pickled.text)
 
 
-def _reply(channel: Channel, number: int, answer: _Answer) -> Any:
-    """Send an answer; return the result if it has proxies in it."""
+def _encoded(thread: ClientThread, number: int, answer: _Answer) -> tuple[bytes, Any]:
+    """Return the message of an answer.  If it has proxies in it, the thread keeps their objects."""
     try:
         payload, buffers = reduction.encode((number, *answer))
+    except BaseException:  # the answer does not pickle
+        payload, buffers = _failure(number)
+    thread.kept = answer[1] if _PROXY in payload else None
+    return payload, buffers
+
+
+def _send(channel: Channel, number: int, payload: bytes, buffers: Any) -> None:
+    try:
         channel.send(payload, buffers)
     except BrokenPipeError:
         raise
-    except BaseException:  # the answer does not pickle, or there is no memory for it
-        payload, buffers = reduction.encode((number, "#UNSERIALIZABLE", format_exc()))
-        channel.send(payload, buffers)
-    return answer[1] if _PROXY in payload else None
+    except BaseException:  # there is no memory for the answer
+        channel.send(*_failure(number))
+
+
+def _failure(number: int) -> tuple[bytes, Any]:
+    return reduction.encode((number, "#UNSERIALIZABLE", format_exc()))

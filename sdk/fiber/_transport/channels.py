@@ -49,6 +49,12 @@ class Channel(Protocol):
         ``passing``: the caller soon copies or releases the large parts of the message.
         """
 
+    def exchange(self, payload: bytes) -> Message:
+        """Send one message; return the next one, on another host by the same request.
+
+        BrokenPipeError or ConnectionClosed at the end.  The message may have been sent or not.
+        """
+
     def recv_object(self) -> Any:
         """Return the next message, unpickled."""
 
@@ -282,6 +288,11 @@ class UnixChannel:
     def recv(self, *, passing: bool = False) -> Message:
         """Return the next message; ConnectionClosed at the end."""
         return packet.receive(self._sock, passing=passing)
+
+    def exchange(self, payload: bytes) -> Message:
+        """Send one message; return the next one."""
+        self.send(payload)
+        return self.recv()
 
     def recv_object(self) -> Any:
         """Return the next message, unpickled; ConnectionClosed at the end."""
