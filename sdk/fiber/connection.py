@@ -116,6 +116,21 @@ class Connection(Generic[_Sent_contra, _Received_co]):
             raise self._misuse("read-only")
         channel.send_unconfirmed(*_encoded(obj))
 
+    def _exchange(self, obj: Any) -> Message:
+        """Send an object, and return the next message, not unpickled.
+
+        Between hosts that takes one request, where ``send`` and ``recv`` take two.  If ``obj``
+        cannot be pickled, nothing is sent.
+        """
+        channel = self._channel
+        if channel is None or not (self._readable and self._writable):
+            raise self._misuse("one-way")
+        encoded = _encoded(obj)
+        try:
+            return channel.exchange(*encoded, soon=True)
+        except ConnectionClosed as error:
+            raise self._explained(error) from None
+
     def send_bytes(self, buf: BytesLike, offset: int = 0, size: int | None = None) -> None:
         """Send bytes as one message."""
         channel = self._channel

@@ -21,6 +21,7 @@ from fiber._hub.local import LocalChannel, LocalCounter
 from fiber._hub.remote import RemoteCounter
 from fiber._hub.streams import WINDOW
 from fiber._transport.channels import wait_readable
+from fiber._wire import packet
 from fiber.connection import Connection, wait
 from fiber.errors import ConnectionClosed
 from hosts import Far, Hosts, Wire, background, objects_kept
@@ -165,6 +166,59 @@ def test_an_exchange_does_not_overtake_an_unconfirmed_message(
     there._channel.send_unconfirmed(b"1")
     assert there._channel.exchange(b"2").tobytes() == b"answer"
     assert [here.recv_bytes() for _ in range(2)] == [b"1", b"2"]
+
+
+def test_large_exchanges_keep_their_order(
+    far_pipe: tuple[Connection, Connection],
+) -> None:
+    here, there = far_pipe
+    there._send_unconfirmed("before")
+    got: list[Any] = []
+
+    def exchange() -> None:
+        for _ in range(2):
+            got.append(packet.loads(there._exchange(np.ones(3 * WINDOW, np.uint8))).nbytes)
+
+    exchanger = background(exchange)
+    assert here.recv() == "before"
+    for _ in range(2):
+        assert here.recv().nbytes == 3 * WINDOW
+        here.send(np.ones(2 * WINDOW, np.uint8))
+    exchanger.join(PATIENCE)
+    assert got == [2 * WINDOW] * 2
+
+
+def test_an_exchange_that_cannot_be_pickled_sends_nothing(
+    far_pipe: tuple[Connection, Connection],
+) -> None:
+    here, there = far_pipe
+    with pytest.raises(TypeError):
+        there._exchange(threading.Lock())
+    assert not here.poll()
+    here.send(1)
+    assert there.recv() == 1
+
+
+@pytest.mark.parametrize("late", [True, False], ids=["late", "lost"])
+def test_an_interrupted_exchange_keeps_the_order(
+    far_pipe: tuple[Connection, Connection], monkeypatch: pytest.MonkeyPatch, late: bool
+) -> None:
+    def interrupted(*arguments: Any) -> None:
+        if not late:  # the reply is read, and lost
+            reply(*arguments)
+        raise KeyboardInterrupt
+
+    here, there = far_pipe
+    reply = HubStream._reply
+    for number in range(2):
+        here.send(number)
+    with monkeypatch.context() as ctrl_c:
+        ctrl_c.setattr(HubStream, "_reply", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            there._exchange("a")
+    assert here.recv() == "a"
+    assert packet.loads(there._exchange("b")) == (0 if late else 1)
+    assert here.recv() == "b"
 
 
 def test_threads_that_wait_do_not_wait_for_each_other(far: Far) -> None:

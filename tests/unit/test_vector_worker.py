@@ -46,7 +46,11 @@ def told(
     monkeypatch.setattr(worker_module, "time", clock)
     shape = ArrayLayout(Discrete(2), Discrete(2), ROWS, 1)
     memory = ArrayMemory.allocate(shape.size()) if shared else None
-    connection: Any = SimpleNamespace(_send_unconfirmed=lambda answer: answers.append(answer.rows))
+
+    def note(answer: Any) -> None:
+        answers.append(answer.rows)
+
+    connection: Any = SimpleNamespace(_send_unconfirmed=note, _exchange=note)
     setup = Setup(0, 0, [], AutoresetMode.NEXT_STEP, restart=False, timeout=None)
     slots = [Steps(clock, each) for each in seconds]
     worker = EnvironmentWorker(connection, setup, slots, Begin(shape, memory))

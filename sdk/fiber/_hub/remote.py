@@ -221,14 +221,16 @@ class RemoteChannel(RemoteObject):
         assert message is not None
         return message
 
-    def exchange(self, payload: bytes) -> Message:
+    def exchange(
+        self, payload: BytesLike, buffers: Sequence[memoryview] = (), *, soon: bool = False
+    ) -> Message:
         """Send one message and return the next one, by one request.
 
         BrokenPipeError or ConnectionClosed at the end.  The message may have been sent or not.
         """
         if self._unconfirmed:  # on other streams, which this message must not overtake
             self._confirm()
-        message = self._receive(Op.EXCHANGE, buffers=[memoryview(payload)])
+        message = self._receive(Op.EXCHANGE, buffers=[memoryview(payload), *buffers])
         assert message is not None
         return message
 

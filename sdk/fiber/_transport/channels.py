@@ -49,10 +49,13 @@ class Channel(Protocol):
         ``passing``: the caller soon copies or releases the large parts of the message.
         """
 
-    def exchange(self, payload: bytes) -> Message:
+    def exchange(
+        self, payload: BytesLike, buffers: Sequence[memoryview] = (), *, soon: bool = False
+    ) -> Message:
         """Send one message; return the next one, on another host by the same request.
 
-        BrokenPipeError or ConnectionClosed at the end.  The message may have been sent or not.
+        ``soon``: the next message probably comes soon.  BrokenPipeError or ConnectionClosed at the
+        end.  The message may have been sent or not.
         """
 
     def recv_object(self) -> Any:
@@ -289,11 +292,6 @@ class UnixChannel:
         """Return the next message; ConnectionClosed at the end."""
         return packet.receive(self._sock, passing=passing)
 
-    def exchange(self, payload: bytes) -> Message:
-        """Send one message; return the next one."""
-        self.send(payload)
-        return self.recv()
-
     def recv_object(self) -> Any:
         """Return the next message, unpickled; ConnectionClosed at the end."""
         message = self._looked_for()
@@ -305,6 +303,13 @@ class UnixChannel:
         """Receive a message that probably comes soon, as ``recv`` does."""
         message = self._looked_for()
         return packet.receive(self._sock) if message is None else message
+
+    def exchange(
+        self, payload: BytesLike, buffers: Sequence[memoryview] = (), *, soon: bool = False
+    ) -> Message:
+        """Send one message; return the next one."""
+        self.send(payload, buffers)
+        return self.recv_answer() if soon else self.recv()
 
     def _looked_for(self) -> Message | None:
         if _last_asked == id(self):

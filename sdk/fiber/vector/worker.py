@@ -23,6 +23,8 @@ from fiber import reduction
 from fiber._agent.exception_pickles import encode_error
 from fiber._exceptions import add_note
 from fiber._hub import client
+from fiber._wire import packet
+from fiber._wire.packet import Message
 from fiber.connection import Connection
 from fiber.vector.arrays import ArrayLayout, ArrayMemory, Packed, StepArrays, in_band
 from fiber.vector.slot import MakeEnv, Note, Slot
@@ -148,6 +150,8 @@ class EnvironmentWorker:
         self._all = range(len(slots))
         self._expected = [0.0] * len(slots)
         """Expected seconds of a step of each environment: a moving average."""
+        self._command: Message | None = None
+        """Next command, if it came with the last answer."""
         self._losses: dict[int, int] = {}
         """Times in a row that an environment was replaced without a success, by row."""
         self._limit = _limit(setup)  # after the environments, which may have set another alarm
@@ -173,12 +177,16 @@ class EnvironmentWorker:
     def run(self) -> None:
         """Carry out commands until the connection ends, with EOFError."""
         while True:
-            operation, *arguments = self._connection.recv()
+            if self._command is None:
+                operation, *arguments = self._connection.recv()
+            else:
+                command, self._command = self._command, None
+                operation, *arguments = packet.loads(command)
             self._operations[operation](*arguments)
 
-    def _send_unconfirmed(self, message: Answer | Results) -> None:
-        # The next command shows that the message has arrived.
-        self._connection._send_unconfirmed(message)
+    def _send_last(self, message: Answer | Results) -> None:
+        """Send the last answer to a command, and receive the next command."""
+        self._command = self._connection._exchange(message)
 
     # Operations
 
@@ -234,12 +242,12 @@ class EnvironmentWorker:
                 failures.append(EnvironmentFailure.of(row, "a call", error))
         at_work[worker] = 0
         try:
-            self._send_unconfirmed(Results(generation, in_band(list(values.values())), failures))
+            self._send_last(Results(generation, in_band(list(values.values())), failures))
         except Exception:  # pickling an answer may raise any class
             for row, refusal in _refused(values.items()):
                 del values[row]
                 failures.append(EnvironmentFailure.of(row, _UNPICKLABLE, refusal))
-            self._send_unconfirmed(Results(generation, in_band(list(values.values())), failures))
+            self._send_last(Results(generation, in_band(list(values.values())), failures))
 
     # Parts of all operations
 
@@ -283,7 +291,8 @@ class EnvironmentWorker:
             if len(report.rows) == 1:
                 report.due = now + self._report_after
         at_work[worker] = 0
-        send(report, whole=rows is None and len(report.rows) == len(self._all))
+        whole = rows is None and len(report.rows) == len(self._all)
+        send(report, whole=whole, last=True)
 
     def _retry(
         self,
@@ -318,12 +327,15 @@ class EnvironmentWorker:
         report: _Report,
         *,
         whole: bool,
+        last: bool = False,
     ) -> None:
         while True:
             try:
-                self._send_unconfirmed(
-                    report.answer(self._arrays, whole=whole, shared=self._shared)
-                )
+                answer = report.answer(self._arrays, whole=whole, shared=self._shared)
+                if last:
+                    self._send_last(answer)
+                else:  # the next answer shows that this one has arrived
+                    self._connection._send_unconfirmed(answer)
                 return
             except Exception:  # pickling an answer may raise any class
                 whole = False
