@@ -398,3 +398,29 @@ runpy.run_module("fiber.agent", run_name="__main__")
 """
     ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert ran.stdout == "False\nTrue\n", ran.stderr
+
+
+def test_a_signal_that_another_thread_takes_before_the_restart_is_not_lost(pool: Pool) -> None:
+    """The last look for signals is over, and the restart has not begun."""
+    late = """
+    import os, signal, threading
+    restart = os.execve
+
+    def take():
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGTERM,))
+        signal.pthread_kill(threading.get_ident(), signal.SIGTERM)
+
+    def after_a_signal(*command):
+        thread = threading.Thread(target=take)
+        thread.start()
+        thread.join()
+        restart(*command)
+
+    os.execve = after_a_signal
+    """
+    agent = pool.agent(30, late + AGENT)
+    master = pool.master()
+    assert master.line() == "joined warm-0"
+    master.signal(signal.SIGTERM)
+    assert master.wait() == 0
+    assert agent.wait() == 0

@@ -45,6 +45,7 @@ _LOST_GRACE = "FIBER_AGENT_LOST_GRACE"
 _WAITS_UNTIL = (
     "FIBER_AGENT_WAITS_UNTIL"  # time.monotonic(), from an agent to itself after its restart
 )
+_SIGNALS = "FIBER_AGENT_SIGNALS"  # descriptor, from an agent to itself after its restart
 
 _TERMINATION_GRACE = "FIBER_AGENT_TERMINATION_GRACE"
 _LINKED = "FIBER_AGENT_LINKED"
@@ -114,7 +115,7 @@ class Main:
         self._service: AgentService | None = None
         self._status = 0
         self._again = False
-        self._terminating = False
+        self._terminating = _last_run_took_sigterm()
         # From here on there is a directory, which must be removed at a SIGTERM too.
         signal.signal(signal.SIGTERM, self._on_sigterm)
         parent, directory = config.current().runtime_directory, os.environ.pop(_DIRECTORY, None)
@@ -132,6 +133,8 @@ class Main:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.pthread_sigmask(signal.SIG_SETMASK, ())  # its last run or the starter blocks some
         self._end_with_parent()
+        if self._terminating:
+            self._on_sigterm()
         self._loop.run()
         self._dialer.close()
         self._agent.close()
@@ -148,6 +151,7 @@ class Main:
             self._hand_on_credentials()
             # The lines above take seconds, in which another thread may have taken the signal.
             if not self._is_terminating():
+                self._hand_on_signals()
                 os.execve(sys.executable, command, self._environment)
         signal.set_wakeup_fd(-1)
         for end in self._signals:
@@ -164,6 +168,12 @@ class Main:
         descriptor = self._dialer.credentials.to_descriptor()
         os.set_inheritable(descriptor, True)
         self._environment[_CREDENTIALS] = f"{_DESCRIPTOR}{descriptor}"
+
+    def _hand_on_signals(self) -> None:
+        """Let the next run see a signal that another thread takes until this one is replaced."""
+        descriptor = self._signals[0].fileno()
+        os.set_inheritable(descriptor, True)
+        self._environment[_SIGNALS] = str(descriptor)
 
     def _dial(self) -> AgentDialer:
         return AgentDialer(
@@ -339,6 +349,20 @@ def _seconds(variable: str) -> float | None:
     if not (math.isfinite(seconds) and seconds >= 0):
         raise ConfigError(f"{variable}={value!r} is not a number of seconds")
     return seconds
+
+
+def _last_run_took_sigterm() -> bool:
+    """Return whether SIGTERM came after the last run had looked for it, and before this run."""
+    value = os.environ.pop(_SIGNALS, None)
+    if value is None:
+        return False
+    descriptor = int(value)
+    try:
+        return signal.SIGTERM in os.read(descriptor, 4096)
+    except BlockingIOError:  # no signal came, and a child of a task still has the other end
+        return False
+    finally:
+        os.close(descriptor)
 
 
 def _pid(variable: str) -> int | None:
