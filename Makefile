@@ -22,7 +22,7 @@ unexport PYTHONDONTWRITEBYTECODE
 CLUSTER := PYTHONPATH=tests $(BIN)/python -m cluster
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-fast test-pythons test-long e2e lint bench bench-operator bench-kubernetes paper conformance conformance-original published crds docs pictures images cluster cluster-down release release-prepare release-dry-run clean
+.PHONY: help demo test test-fast test-pythons test-long e2e lint bench bench-operator bench-kubernetes paper paper-populations conformance conformance-original published crds docs pictures images cluster cluster-down release release-prepare release-dry-run clean
 
 help:
 	@sed -n 's/^## //p' $(MAKEFILE_LIST)
@@ -114,6 +114,10 @@ bench-kubernetes: $(VENV)/.with-bench $(VENV)/.with-dev
 ## make paper         the paper's experiments beside the peers; writes docs/paper.md and docs/paper
 paper: $(VENV)/.with-bench $(VENV)/.with-stable-baselines3 $(VENV)/.with-games
 	$(BIN)/python -m benchmarks.paper
+
+## make paper-populations  part (d) of it: pods that follow a population, on a cluster (root, Go)
+paper-populations: $(VENV)/.with-dev
+	PYTHONPATH=tests $(BIN)/python -m benchmarks.paper.populations --set-up
 
 ## make conformance   CPython's tests of multiprocessing and executors, joblib's (BACKEND=local, loopback or kubernetes)
 conformance: $(VENV)/.with-dev $(VENV)/.with-testsuite

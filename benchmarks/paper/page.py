@@ -9,7 +9,7 @@ from pathlib import Path
 from benchmarks import overhead, report
 from benchmarks.contenders import BY_NAME
 from benchmarks.model import Case, Metric, Run
-from benchmarks.paper import breakout, evolution, walker
+from benchmarks.paper import breakout, evolution, populations_results, walker
 from benchmarks.paper.parts import PARTS
 from benchmarks.samples import Summary, in_words, ratio, summary, times
 from benchmarks.session import ROOT
@@ -41,6 +41,8 @@ def generated(folder: Path, runs: Mapping[str, Run]) -> dict[str, str]:
     texts = {name: _TEXTS[name](runs[name]) for name in PARTS if name in runs}
     if (folder / walker.RESULTS).exists():
         texts["walker"] = _walker(walker.load(folder))
+    if (folder / populations_results.RESULTS).exists():
+        texts["populations"] = populations_results.text(populations_results.load(folder))
     return texts
 
 

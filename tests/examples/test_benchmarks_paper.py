@@ -79,3 +79,47 @@ def test_a_recording_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     walker = recording.read(recording.WALKER, tmp_path)
     assert len(walker.steps) == len(walker.seconds) == 2
     assert len(recording.read(recording.BREAKOUT, tmp_path).seconds) == 20
+
+
+def test_the_picture_of_populations_has_a_panel_for_each_run(tmp_path: Path) -> None:
+    # In a separate process, because matplotlib never closes the fonts that it opens.
+    statement = (
+        "import dataclasses, pathlib, sys\n"
+        "from benchmarks.paper import page, populations_picture\n"
+        "from benchmarks.paper import populations_results as results\n"
+        "found, folder = results.load(page.FOLDER), pathlib.Path(sys.argv[1])\n"
+        "for names in (list(found.traces), ['poet']):\n"
+        "    traces = {name: found.traces[name] for name in names}\n"
+        "    populations_picture.draw(dataclasses.replace(found, traces=traces), folder)\n"
+        "    print((folder / results.PICTURE).stat().st_size)\n"
+    )
+    command = [sys.executable, "-c", statement, str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE)
+    assert done.returncode == 0, done.stderr
+    both, one = map(int, done.stdout.split())
+    assert both > one > 10_000
+
+
+@pytest.mark.parametrize("allocation", ["dynamic", "static"])
+def test_a_program_plays_its_plan_and_tells_the_open_tasks(allocation: str) -> None:
+    phases = [
+        {"gpu": False, "peak": 2, "waves": [[0.0], [0.01, 0.0]]},
+        {"gpu": True, "peak": 1, "waves": [[0.0]]},
+    ]
+    request = json.dumps({"allocation": allocation, "idle": 4.0, "phases": phases})
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "benchmarks" / "paper" / "populations_program.py")],
+        input=request,
+        env={**os.environ, "FIBER_BACKEND": "local"},
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+    )
+    assert done.returncode == 0, done.stderr
+    events = [json.loads(line) for line in done.stdout.splitlines()]
+    times = [at for _, at, _ in events]
+    assert times == sorted(times)
+    told = [(name, number) for name, _, number in events]
+    opened = [number for name, number in told if name == "open"]
+    assert (told[0], told[-1]) == (("begin", 0), ("end", 0))
+    assert opened == [1, 0, 2, 1, 0, 1, 0]
