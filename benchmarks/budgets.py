@@ -215,7 +215,7 @@ def _vector() -> Iterator[Budget]:
     yield budget(what, vector.uneven(64, first_ready=True), 1.5, to_case=waiting)
     case = vector.pixels(64)
     ours = {"contender": "fiber-loopback", "against": "fiber"}
-    yield budget(f"loopback to local, {case}", case, 0.5, **ours)
+    yield budget(f"loopback to local, {case}", case, 0.4, **ours)
 
 
 def _sharing() -> Iterator[Budget]:

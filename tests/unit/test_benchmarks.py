@@ -259,7 +259,7 @@ def test_the_budgets_of_the_vector_are_those_of_the_design() -> None:
             "64 uneven ones",
             1.5,
         ),
-        ("vector: loopback to local, 64 with 84x84x4 bytes", "fiber-loopback", "fiber", "", 0.5),
+        ("vector: loopback to local, 64 with 84x84x4 bytes", "fiber-loopback", "fiber", "", 0.4),
     }
 
 
