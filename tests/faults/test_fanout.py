@@ -25,7 +25,7 @@ from faults.proxy import Proxy
 from faults.runtime import running
 from faults.test_strangers import GARBAGE, Bomb
 from fiber import config
-from fiber._agent.blobs import BlobFetch, BlobSource, BlobStore
+from fiber._agent.blobs import BlobFetch, BlobSource, BlobStore, _Receiver
 from fiber._backends import loopback
 from fiber._backends.blobs import BlobSender, Fanout
 from fiber._backends.loopback import LoopbackBackend
@@ -358,6 +358,26 @@ def test_bytes_with_another_digest_are_refused_and_not_unpickled(
     assert result.reason == "what it sent is not the blob that the master named"
     assert not trace.exists()
     liar.close()
+
+
+def test_a_source_that_announces_more_than_the_master_named_is_left(loop: Loop) -> None:
+    liar = Liar(loop, KeepBlob(DIGEST, bytes(2 * LARGE)))
+    result = fetch(loop, liar)
+    size = KeepBlob.frame_size(LARGE)
+    assert f"{size + LARGE} bytes are announced, and {size} may come" in result.reason
+    liar.close()
+
+
+def test_a_receiver_with_a_large_request_is_cut_off(
+    loop: Loop, source: BlobSource, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reasons: list[str] = []
+    with monkeypatch.context() as patch:
+        patch.setattr(_Receiver, "on_lost", lambda self, reason: reasons.append(reason))
+        patch.setattr(Want, "encode", lambda self: KeepBlob(DIGEST, bytes(LARGE)).encode())
+        assert not fetch(loop, source).data
+    assert "bytes are announced, and 0 may come" in reasons[0]
+    assert fetch(loop, source).data == DATA
 
 
 def test_an_answer_that_is_no_blob_is_refused(loop: Loop) -> None:

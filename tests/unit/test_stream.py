@@ -18,6 +18,7 @@ from fiber._transport.link_protocol import (
     LARGE,
     LAST,
     SIZE,
+    SLOT_SHIFT,
     WINDOW,
     WINDOW_BYTES,
     Gap,
@@ -422,6 +423,18 @@ def test_a_datagram_that_no_stream_sends_is_refused(datagram: bytes, complaint: 
     stream, _ = pair()
     with pytest.raises(ProtocolError, match=complaint):
         stream.received(datagram, 0)
+
+
+def test_frames_in_pieces_have_no_more_bytes_at_the_same_time_than_the_limit() -> None:
+    stream, _ = pair()
+    stream.largest = 9
+    slot = 1 << SLOT_SHIFT
+    within = entries((FIRST, SIZE.pack(4) + b"12"), (FIRST | slot, SIZE.pack(5) + b"12"))
+    assert stream.received(within, 0) == []
+    stream, _ = pair()
+    stream.largest = 8
+    with pytest.raises(ProtocolError, match="9 bytes are announced, and 8 may come"):
+        stream.received(within, 0)
 
 
 @given(st.binary(max_size=80))

@@ -219,6 +219,7 @@ class BlobSource:
             return f"this agent serves {_LINKS} others already"
         receiver = _Receiver(self._loop, self._store, link, self._receivers.discard)
         self._receivers.add(receiver)
+        link.limit(0)  # a Want fits into one datagram
         link.attach(receiver)
         return None
 
@@ -286,6 +287,7 @@ class BlobFetch:
     ) -> None:
         self._loop = loop
         self._digest = order.digest
+        self._size = order.size
         self._on_blob = on_blob
         self._on_failed = on_failed
         self._over = False
@@ -311,6 +313,7 @@ class BlobFetch:
             link.close("the transfer was ended", linger=0.0)
             return
         self._link = link
+        link.limit(KeepBlob.frame_size(self._size))
         link.attach(self)
         link.send(Want(self._digest).encode())
 

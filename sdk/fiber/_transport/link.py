@@ -147,6 +147,13 @@ class Link:
         """True if the peer has ever sent a datagram."""
         return self._protocol.has_received
 
+    def limit(self, largest: int) -> None:
+        """End the link when the peer announces frames that have more bytes at the same time.
+
+        A frame that fits into one datagram may always come.  Runs on the loop thread.
+        """
+        self._protocol.largest = largest
+
     def attach(self, observer: LinkObserver) -> None:
         """Set the observer.  Frames that arrived before wait for it."""
         self._observer = observer

@@ -302,6 +302,8 @@ class LinkProtocol:
         self._received = 0
         self._assemblies: list[Assembly | None] = [None] * SLOTS
         """Frames of which some pieces have arrived, by slot."""
+        self.largest: int | None = None
+        """Limit of the bytes of all frames that arrive in pieces at the same time."""
         self._ack_due: float | None = None
         self._unanswered = self._unanswered_bytes = 0
         """Datagrams, and their bytes, that arrived since this side last acknowledged."""
@@ -526,6 +528,7 @@ class LinkProtocol:
         try:
             if assembly is None:
                 (size,) = SIZE.unpack_from(piece)
+                self._check_room_for(size)
                 piece = piece[SIZE.size :]
                 assembly = Assembly(size, passed_on=is_passed_on(piece))
                 self._assemblies[slot] = assembly
@@ -536,6 +539,11 @@ class LinkProtocol:
             return [assembly.frame()]
         except (struct.error, ValueError, OverflowError, OSError) as error:
             raise ProtocolError(f"a frame in pieces cannot be put together: {error}") from error
+
+    def _check_room_for(self, size: int) -> None:
+        total = size + sum(each.size for each in self._assemblies if each is not None)
+        if self.largest is not None and total > self.largest:
+            raise ValueError(f"{total} bytes are announced, and {self.largest} may come")
 
 
 def _size(datagram: Datagram) -> int:

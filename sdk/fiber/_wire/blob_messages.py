@@ -35,6 +35,11 @@ class KeepBlob(NamedTuple):
     digest: bytes
     data: BytesLike
 
+    @staticmethod
+    def frame_size(size: int) -> int:
+        """Return the bytes of the frame of a blob that has ``size`` bytes."""
+        return _HEAD.size + size
+
     def encode(self) -> bytes:
         """Return the frame."""
         return b"".join(self.pieces())
@@ -89,7 +94,7 @@ class Fetch(NamedTuple):
     number: int
     """Number of this order, for Unfetched."""
     size: int
-    """Bytes of the blob, which bound the time of the transfer."""
+    """Bytes of the blob, which bound the time and the memory of the transfer."""
     address: str
     uid: str
     """Random word under which the agent asks: each order has another one."""
