@@ -109,6 +109,30 @@ def test_a_change_of_what_a_function_reads_reaches_workers(
         assert session.sent()(11) == result
 
 
+def test_two_functions_with_equal_pickles_share_no_values(session: Session) -> None:
+    session.run(
+        "def counting():\n"
+        "    count = 0\n"
+        "    def inner():\n"
+        "        nonlocal count\n"
+        "        count += 1\n"
+        "        return count\n"
+        "    return inner\n"
+        "one, other = counting(), counting()\n"
+    )
+    assert [session.sent("one")(), session.sent("one")()] == [1, 2]
+    assert session.sent("other")() == 1
+
+
+def test_a_value_that_was_changed_back_reaches_workers(session: Session) -> None:
+    session.run("def grow(): global scale; scale += 1; return scale")
+    assert session.sent("grow")() == 3
+    session.run("scale = 9")
+    assert session.sent("grow")() == 10
+    session.run("scale = 2")
+    assert session.sent("grow")() == 3
+
+
 def test_a_change_of_a_closure_reaches_workers(session: Session) -> None:
     before = session.light("plus")
     session.names["plus"].__closure__[0].cell_contents = 20
@@ -146,6 +170,13 @@ UNSTABLE = {
     "a module that cannot be imported": "scale = type(collections)('made_up')",
     "a mutable default": "scaled.__defaults__ = ([],)",
     "an object as an attribute": "scaled.cache = {}",
+    "a list beside a type": "import typing; scale = typing.Annotated[int, []]",
+    "a type variable with a class of the session": (
+        "import typing\nclass Own: pass\nscale = typing.TypeVar('T', bound=Own)"
+    ),
+    "a type variable between classes of the session": (
+        "import typing\nclass Own: pass\nscale = typing.TypeVar('T', Own, int)"
+    ),
 }
 
 

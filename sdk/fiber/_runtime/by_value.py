@@ -9,6 +9,7 @@ such as a list, an array or a class of the session, is pickled for each call.
 
 from __future__ import annotations
 
+import itertools
 import sys
 import types
 from collections.abc import Callable, Iterable, Iterator
@@ -22,6 +23,9 @@ from fiber._wire import work
 
 FUNCTION_SIZE = 1 << 16
 """Bytes of the largest pickle of a function that is kept, here and in a FunctionCache."""
+
+_numbers = itertools.count()
+"""Numbers of pickles.  Two functions with equal pickles are two functions in a worker, too."""
 
 
 class FunctionPickles:
@@ -52,7 +56,7 @@ class FunctionPickles:
             return None
         if not reads.are_same():  # another thread changed a global meanwhile
             return None
-        pickled = FunctionByValue(data)
+        pickled = FunctionByValue(data, next(_numbers))
         if len(self._known) >= FUNCTIONS:
             self._known.clear()  # in one step, as several threads may call this
         self._known[function] = _KnownFunction(reads, pickled)
@@ -182,7 +186,13 @@ def _parts_of(value: Any) -> Iterable[Any] | None:
         return tuple(value)
     annotation = isinstance(value, types.GenericAlias | types.UnionType)
     if annotation or type(value).__module__ == "typing":
-        return (getattr(value, "__origin__", None), *getattr(value, "__args__", ()))
+        return (
+            getattr(value, "__origin__", None),
+            *getattr(value, "__args__", ()),
+            *getattr(value, "__metadata__", ()),  # of Annotated
+            getattr(value, "__bound__", None),  # of a TypeVar, as are its constraints
+            *getattr(value, "__constraints__", ()),
+        )
     return None
 
 
