@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import pickle
 import weakref
+from collections.abc import Callable
 from multiprocessing import AuthenticationError
 from multiprocessing import connection as _mp
 from multiprocessing.connection import Client, Listener, answer_challenge, deliver_challenge
@@ -116,20 +117,24 @@ class Connection(Generic[_Sent_contra, _Received_co]):
             raise self._misuse("read-only")
         channel.send_unconfirmed(*_encoded(obj))
 
-    def _exchange(self, obj: Any) -> Message:
-        """Send an object, and return the next message, not unpickled.
+    def _exchange(self, obj: Any) -> Callable[[], Message]:
+        """Pickle an object; return a function that sends it, and returns the next message.
 
-        Between hosts that takes one request, where ``send`` and ``recv`` take two.  If ``obj``
-        cannot be pickled, nothing is sent.
+        The message is not unpickled.  Between hosts that takes one request, where ``send`` and
+        ``recv`` take two.
         """
         channel = self._channel
         if channel is None or not (self._readable and self._writable):
             raise self._misuse("one-way")
         encoded = _encoded(obj)
-        try:
-            return channel.exchange(*encoded, soon=True)
-        except ConnectionClosed as error:
-            raise self._explained(error) from None
+
+        def exchange() -> Message:
+            try:
+                return channel.exchange(*encoded, soon=True)
+            except ConnectionClosed as error:
+                raise self._explained(error) from None
+
+        return exchange
 
     def send_bytes(self, buf: BytesLike, offset: int = 0, size: int | None = None) -> None:
         """Send bytes as one message."""

@@ -177,7 +177,7 @@ def test_large_exchanges_keep_their_order(
 
     def exchange() -> None:
         for _ in range(2):
-            got.append(packet.loads(there._exchange(np.ones(3 * WINDOW, np.uint8))).nbytes)
+            got.append(packet.loads(there._exchange(np.ones(3 * WINDOW, np.uint8))()).nbytes)
 
     exchanger = background(exchange)
     assert here.recv() == "before"
@@ -215,9 +215,9 @@ def test_an_interrupted_exchange_keeps_the_order(
     with monkeypatch.context() as ctrl_c:
         ctrl_c.setattr(HubStream, "_reply", interrupted)
         with pytest.raises(KeyboardInterrupt):
-            there._exchange("a")
+            there._exchange("a")()
     assert here.recv() == "a"
-    assert packet.loads(there._exchange("b")) == (0 if late else 1)
+    assert packet.loads(there._exchange("b")()) == (0 if late else 1)
     assert here.recv() == "b"
 
 

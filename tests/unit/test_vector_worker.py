@@ -9,10 +9,13 @@ import pytest
 from gymnasium.spaces import Discrete
 from gymnasium.vector import AutoresetMode
 
+from fiber.connection import Pipe
 from fiber.vector import worker as worker_module
 from fiber.vector.arrays import ArrayLayout, ArrayMemory
 from fiber.vector.slot import Slot
 from fiber.vector.worker import Begin, EnvironmentWorker, Setup
+from hosts import background
+from patience import PATIENCE
 
 ROWS = 4
 MS = 1e-3
@@ -78,3 +81,30 @@ def test_a_finished_environment_does_not_wait_for_a_slow_one(
 def test_a_message_between_hosts_costs_more(monkeypatch: pytest.MonkeyPatch) -> None:
     assert told(monkeypatch, [0.5 * MS] * ROWS, shared=True) == [[0], [1], [2], [3]]
     assert told(monkeypatch, [0.5 * MS] * ROWS, shared=False) == [None]
+
+
+class Named(Slot):
+    """An environment with a name."""
+
+    def __init__(self) -> None:
+        """Make no environment."""
+
+    def name(self) -> str:
+        return "named"
+
+
+def test_a_worker_whose_learner_ends_sends_its_last_answer_once() -> None:
+    here, there = Pipe()
+    shape = ArrayLayout(Discrete(2), Discrete(2), 1, 1)
+    setup = Setup(0, 0, [], AutoresetMode.NEXT_STEP, restart=False, timeout=None)
+    worker = EnvironmentWorker(there, setup, [Named()], Begin(shape, None))
+    here.send(("call", 0, None, "name", [()]))
+
+    def take_the_answer_and_end() -> None:
+        here.recv()
+        here.close()
+
+    learner = background(take_the_answer_and_end)
+    with pytest.raises(EOFError):
+        worker.run()
+    learner.join(PATIENCE)

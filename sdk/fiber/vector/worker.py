@@ -150,8 +150,8 @@ class EnvironmentWorker:
         self._all = range(len(slots))
         self._expected = [0.0] * len(slots)
         """Expected seconds of a step of each environment: a moving average."""
-        self._command: Message | None = None
-        """Next command, if it came with the last answer."""
+        self._exchange: Callable[[], Message] | None = None
+        """Function that sends the last answer to a command, and returns the next command."""
         self._losses: dict[int, int] = {}
         """Times in a row that an environment was replaced without a success, by row."""
         self._limit = _limit(setup)  # after the environments, which may have set another alarm
@@ -177,16 +177,16 @@ class EnvironmentWorker:
     def run(self) -> None:
         """Carry out commands until the connection ends, with EOFError."""
         while True:
-            if self._command is None:
-                operation, *arguments = self._connection.recv()
-            else:
-                command, self._command = self._command, None
-                operation, *arguments = packet.loads(command)
+            operation, *arguments = self._next_command()
             self._operations[operation](*arguments)
 
+    def _next_command(self) -> Any:
+        exchange, self._exchange = self._exchange, None
+        return self._connection.recv() if exchange is None else packet.loads(exchange())
+
     def _send_last(self, message: Answer | Results) -> None:
-        """Send the last answer to a command, and receive the next command."""
-        self._command = self._connection._exchange(message)
+        """Pickle the last answer to a command.  It is sent as the next command is awaited."""
+        self._exchange = self._connection._exchange(message)
 
     # Operations
 
