@@ -12,6 +12,8 @@ from benchmarks import report
 from benchmarks.paper.populations_plan import GO_EXPLORE, POET
 from benchmarks.samples import in_words, times
 
+from fiber.resources import GPU
+
 RESULTS = "populations.json"
 PICTURE = "populations.png"
 DYNAMIC, STATIC = "dynamic", "static"
@@ -19,7 +21,6 @@ TITLES = {POET: "POET-like", GO_EXPLORE: "Go-Explore-like"}
 Steps = Sequence[tuple[float, float]]
 Body = dict[str, Any]
 
-_GPU = "nvidia.com/gpu"
 _UNITS = {"m": 1e-3, "u": 1e-6, "n": 1e-9, "k": 1e3}
 
 
@@ -147,7 +148,7 @@ def held(pod: Body) -> Held | None:
     resources = [each.get("resources", {}) for each in pod["spec"]["containers"]]
     return Held(
         sum(processors(each.get("requests", {}).get("cpu", "0")) for each in resources),
-        sum(int(each.get("limits", {}).get(_GPU, 0)) for each in resources),
+        sum(int(each.get("limits", {}).get(GPU, 0)) for each in resources),
         phase == "Running",
     )
 
