@@ -29,13 +29,13 @@ from typing import Any, Generic, TypeVar
 from fiber import reduction
 from fiber._hub import local
 from fiber._hub.local import LocalChannel, LocalCounter
+from fiber._hub.protocol import RECHECK
 from fiber._hub.queue_delivery import Dealer, Feeder, ItemCount, QueueSlots, become_reader
 from fiber._transport.channels import SharedCounter
 from fiber._wire import packet
 from fiber._wire.packet import Message
 from fiber.connection import Connection
 from fiber.connection import Pipe as Pipe  # noqa: PLC0414  # exported: the original has it here
-from fiber.synchronize import RECHECK
 
 __all__ = ["Empty", "Full", "JoinableQueue", "Queue", "SimpleQueue", "SimpleQueuePush"]
 

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar, cast
 
 from fiber._hub import shared_blocks
 from fiber._hub.local import LocalCounter
-from fiber._hub.protocol import Breach
+from fiber._hub.protocol import RECHECK, BarrierState, Breach
 from fiber._hub.shared_blocks import RemoteWaitList
 from fiber._sync.semaphore import COUNTING, RECURSIVE, SEM_VALUE_MAX, Abandoned
 
@@ -46,9 +46,6 @@ __all__ = [
 ]
 
 _T = TypeVar("_T")
-
-RECHECK = 1.0
-"""Seconds after which a waiter checks for itself: the process that should wake it may be dead."""
 
 
 class SemLock:
@@ -343,7 +340,7 @@ class Barrier(threading.Barrier):
         self._members.tally(self._membership, self._counted, self._count + by)
 
     def _enter(self) -> None:
-        while self._state in (_RESETTING, _DRAINING):
+        while self._state in (BarrierState.RESETTING, BarrierState.DRAINING):
             if not self._cond.wait(RECHECK) and self._bury():
                 self._break()
         if self._state < 0:
@@ -351,12 +348,12 @@ class Barrier(threading.Barrier):
 
     def _wait(self, timeout: float | None) -> None:
         deadline = math.inf if timeout is None else time.monotonic() + timeout
-        while self._state == _FILLING:
+        while self._state == BarrierState.FILLING:
             left = max(0.0, deadline - time.monotonic())
             if self._cond.wait(min(left, RECHECK)):
                 continue
             lost = self._bury()
-            if self._state == _FILLING and (lost or left <= RECHECK):
+            if self._state == BarrierState.FILLING and (lost or left <= RECHECK):
                 self._break()
                 breach = Breach.DIED if lost else Breach.LATE
                 raise threading.BrokenBarrierError(*_reason(breach, timeout))
@@ -396,9 +393,6 @@ def _reason(breach: Breach, timeout: float | None) -> list[str]:
     if breach is Breach.DIED:
         return ["a process that took part has died"]
     return [f"the others did not come in {timeout} s"] if breach is Breach.LATE else []
-
-
-_FILLING, _DRAINING, _RESETTING = 0, 1, -1  # states of threading's barrier
 
 
 def _rebuild_barrier(cls: type[Barrier], parts: tuple[Any, ...]) -> Barrier:

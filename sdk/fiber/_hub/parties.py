@@ -13,28 +13,14 @@ left: an interrupt, a death or a late thread cannot give an index twice.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from enum import IntEnum
 from functools import partial
 from typing import TypeAlias
 
 from fiber._hub.hosted import HostedSemaphore, HostedWaitList, Waiter
-from fiber._hub.protocol import Breach, Status
+from fiber._hub.protocol import RECHECK, BarrierState, Breach, Status
 from fiber._hub.registry import Registry
 from fiber._sync.semaphore import SEM_VALUE_MAX
 from fiber._transport.loop import EventLoop, ScheduledCall
-
-RECHECK = 1.0
-"""Seconds after which a waiting thread looks for dead members."""
-
-
-class BarrierState(IntEnum):
-    """State of threading's barrier."""
-
-    FILLING = 0
-    DRAINING = 1
-    RESETTING = -1
-    BROKEN = -2
-
 
 Locked: TypeAlias = Callable[[], bool]
 """Step with the barrier's lock; True if the party keeps the lock."""

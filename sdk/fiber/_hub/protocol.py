@@ -145,6 +145,15 @@ class Status(IntEnum):
     ACT = 6  # the client has to call the action of the barrier, whose lock its stream keeps
 
 
+class BarrierState(IntEnum):
+    """State of threading's barrier."""
+
+    FILLING = 0
+    DRAINING = 1
+    RESETTING = -1
+    BROKEN = -2
+
+
 class Breach(IntEnum):
     """Reason why a wait at a barrier ends with BROKEN."""
 
@@ -152,6 +161,9 @@ class Breach(IntEnum):
     DIED = 1  # a process that took part has died
     LATE = 2  # the others did not come in time
 
+
+RECHECK = 1.0
+"""Seconds after which a waiter checks for itself: the process that should wake it may be dead."""
 
 ENDLESS = (1 << 64) - 1
 """Timeout that never ends, in microseconds."""

@@ -125,7 +125,7 @@ class RemoteSemaphore(RemoteObject):
         stream = self._pop(self._idle)
         try:
             stream.settle()
-            name = memoryview(self._name().encode())
+            name = memoryview(_process_name().encode())
             reply = stream.ask(Op.ACQUIRE, timeout=timeout if block else 0, buffers=[name])
         except ObjectUnreachable:
             self._idle.append(stream)
@@ -218,9 +218,6 @@ class RemoteSemaphore(RemoteObject):
         super()._forked()
         self._holding.clear()
         self._owner, self._depth = None, 0
-
-    def _name(self) -> str:
-        return _process_name()
 
 
 def _process_name() -> str:
