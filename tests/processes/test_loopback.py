@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import io
 import itertools
 import os
 import pickle
@@ -152,19 +153,16 @@ def print_both() -> None:
 
 
 def test_output_of_children_reaches_stderr_with_their_names(
-    shared: Any, capfd: pytest.CaptureFixture[str]
+    shared: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    # Not capfd: it loses what another thread writes while it reads.
+    written = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", written)
     child = fiber.Process(target=print_both, name="writer")
     child.start()
     child.join()
-    seen: list[str] = []
-
-    def complete() -> bool:
-        seen.append(capfd.readouterr().err)
-        return "".join(seen).count("\n") >= 2
-
-    assert census.wait_until(complete, PATIENCE)
-    lines = sorted("".join(seen).splitlines())
+    assert census.wait_until(lambda: written.getvalue().count("\n") >= 2, PATIENCE)
+    lines = sorted(written.getvalue().splitlines())
     assert [line.split("] ")[1] for line in lines] == ["to stderr", "to stdout"]
     assert all(line.startswith("[writer@loopback-") for line in lines)
 
