@@ -235,7 +235,7 @@ $(VENV)-published/.made:
 
 $(VENV)-published/.with-published: $(VENV)-published/.made pyproject.toml tests/published/requirements.txt
 	$(VENV)-published/bin/python -m pip install --quiet --disable-pip-version-check \
-		--editable '.[vector]' --requirement tests/published/requirements.txt
+		--editable '.[kubernetes,vector]' --requirement tests/published/requirements.txt
 	touch $@
 
 .venv-%/.made:
