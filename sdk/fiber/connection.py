@@ -18,7 +18,7 @@ from multiprocessing.connection import Client, Listener, answer_challenge, deliv
 from typing import TYPE_CHECKING, Any, Generic, Self, TypeAlias, overload
 
 from fiber import reduction
-from fiber._hub import handles, local
+from fiber._hub import handles, one_way
 from fiber._transport.channels import Channel, UnixChannel
 from fiber._wire import packet
 from fiber._wire.memory_files import BytesLike
@@ -294,7 +294,7 @@ def Pipe(duplex: bool = True) -> tuple[Connection, Connection]:
 
     Without ``duplex`` the first end only receives and the second only sends.
     """
-    one, other = UnixChannel.pair() if duplex else local.one_way_pair()
+    one, other = UnixChannel.pair() if duplex else one_way.pair()
     first = Connection(one, writable=duplex)
     second = Connection(other, readable=duplex)
     first._other_given_to, second._other_given_to = second._given_to, first._given_to

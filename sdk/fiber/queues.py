@@ -27,7 +27,7 @@ from queue import Empty, Full
 from typing import Any, Generic, TypeVar
 
 from fiber import reduction
-from fiber._hub import local
+from fiber._hub import one_way
 from fiber._hub.local import LocalChannel, LocalCounter
 from fiber._hub.protocol import RECHECK
 from fiber._hub.queue_delivery import Dealer, Feeder, ItemCount, QueueSlots, become_reader
@@ -49,7 +49,7 @@ class Queue(Generic[_T]):
         self._slots: QueueSlots | ItemCount = (
             ItemCount() if maxsize <= 0 else QueueSlots(operator.index(maxsize))
         )
-        self._inbox, self._outbox = LocalChannel.pair()
+        self._inbox, self._outbox = one_way.pair()
         self._open()
 
     def __getstate__(self) -> tuple[Any, ...]:
@@ -226,7 +226,7 @@ class SimpleQueue(Generic[_T]):
     """A queue whose ``put`` waits until the item is in the pipe."""
 
     def __init__(self, *, ctx: Any = None) -> None:
-        inbox, outbox = local.one_way_pair()
+        inbox, outbox = one_way.pair()
         self._reader = Connection(inbox, writable=False)
         self._writer = Connection(outbox, readable=False)
 
@@ -277,7 +277,7 @@ class SimpleQueuePush(Generic[_T]):
     _reader: Connection | None
 
     def __init__(self, *, ctx: Any = None) -> None:
-        inbox, outbox = local.one_way_pair()
+        inbox, outbox = one_way.pair()
         arrivals, registration = LocalChannel.pair()
         Dealer(inbox, arrivals).start()
         self.__setstate__((Connection(outbox, readable=False), registration))

@@ -18,9 +18,10 @@ import pytest
 import fiber
 import fiber.connection
 from census import wait_until
-from fiber._hub import local, queue_delivery
+from fiber._hub import one_way, queue_delivery
 from fiber._hub.hosted import HostedReceiver
-from fiber._hub.local import AMBIGUOUS, LocalChannel, ReceivingEnd, SendingEnd
+from fiber._hub.local import LocalChannel
+from fiber._hub.one_way import AMBIGUOUS, ReceivingEnd, SendingEnd
 from fiber._hub.queue_delivery import Dealer
 from fiber._transport import channels
 from fiber._wire import packet
@@ -37,7 +38,7 @@ Ends = tuple[ReceivingEnd, SendingEnd]
 
 @pytest.fixture
 def ends() -> Iterator[Ends]:
-    receiver, sender = local.one_way_pair()
+    receiver, sender = one_way.pair()
     yield receiver, sender
     receiver.close()
     sender.close()
@@ -59,7 +60,7 @@ def test_a_pair_makes_each_socket_once(monkeypatch: pytest.MonkeyPatch) -> None:
             super().__init__(owner)
 
     monkeypatch.setattr(channels, "BorrowedSocket", Counted)
-    for end in local.one_way_pair():
+    for end in one_way.pair():
         end.close()
     assert len(made) == 2
 
@@ -91,11 +92,11 @@ def test_a_poll_sleeps_as_long_as_it_may(ends: Ends, monkeypatch: pytest.MonkeyP
         naps.append(timeout)
         return len(naps) == 3
 
-    monkeypatch.setattr(local, "wait_readable", readable_in_the_end)
-    for timeout in (None, 10 * local.LOOK_AGAIN):
+    monkeypatch.setattr(one_way, "wait_readable", readable_in_the_end)
+    for timeout in (None, 10 * one_way.LOOK_AGAIN):
         naps.clear()
         assert receiver.poll(timeout)
-        assert naps == [local.LOOK_AGAIN] * 3
+        assert naps == [one_way.LOOK_AGAIN] * 3
     for timeout in (0, -1):
         naps.clear()
         assert not receiver.poll(timeout)
@@ -176,6 +177,86 @@ def test_a_simple_queue_of_another_host_holds_as_much_as_multiprocessings(
     sender.join(60)
     assert not sender.is_alive()
     assert [there.get() for _ in range(count)] == [item] * count
+
+
+def here(queue: Any) -> Any:
+    """Return another holder of a queue in this process."""
+    return pickle.loads(pickle.dumps(queue))
+
+
+@pytest.mark.parametrize("make", [fiber.Queue, fiber.JoinableQueue, lambda: fiber.Queue(30_000)])
+@pytest.mark.parametrize("elsewhere", [False, True], ids=["here", "there"])
+@pytest.mark.parametrize("size", [1, 40, 1000])
+def test_a_process_that_put_as_much_as_multiprocessings_queue_holds_can_end(
+    size: int, elsewhere: bool, make: Callable[[], Any], far: Far
+) -> None:
+    count = held_by_multiprocessing(size, duplex=False)
+    queue = make()
+    holder: Any = far(queue) if elsewhere else here(queue)
+    for _ in range(count):
+        holder.put("x" * size)
+    holder.close()
+    ended = background(holder.join_thread)
+    ended.join(PATIENCE)
+    assert not ended.is_alive()
+    assert [queue.get() for _ in range(count)] == ["x" * size] * count
+
+
+def test_a_bounded_queue_gives_back_the_place_of_each_item_of_its_backlog() -> None:
+    queue: Any = fiber.Queue(MORE_THAN_A_SOCKET)
+    putter = here(queue)
+    for number in range(MORE_THAN_A_SOCKET):
+        putter.put(number)
+    putter.close()
+    putter.join_thread()
+    assert queue.full()
+    assert [queue.get() for _ in range(MORE_THAN_A_SOCKET)] == [*range(MORE_THAN_A_SOCKET)]
+    assert queue.qsize() == 0
+    assert queue.empty()
+
+
+# ``post``, by which a queue sends
+
+
+def test_a_message_waits_for_the_socket_while_receivers_make_room(
+    ends: Ends, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(one_way, "REST", PATIENCE)
+    receiver, sender = ends
+    held = filled(lambda: sender.try_send_directly(b"first"))
+    posting = background(lambda: sender.post(b"last"))
+    assert [receiver.recv().tobytes() for _ in range(held)] == [b"first"] * held
+    posting.join(PATIENCE)
+    assert receiver.recv().tobytes() == b"last"
+    assert not receiver.backlog.words[one_way.TAIL], "it went through the backlog"
+
+
+def test_a_message_waits_until_receivers_have_emptied_the_backlog(
+    ends: Ends, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    receiver, sender = ends
+    overflow(sender)
+    end = receiver.backlog.words[one_way.TAIL]
+    monkeypatch.setattr(one_way, "REST", PATIENCE)
+    posting = background(lambda: sender.post(b"last"))
+    assert len(drain(receiver)) >= MORE_THAN_A_SOCKET
+    posting.join(PATIENCE)
+    assert not posting.is_alive()
+    assert receiver.backlog.words[one_way.TAIL] == end, "it went into the backlog"
+
+
+def test_a_sender_waits_once_for_receivers_that_are_at_rest(
+    ends: Ends, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    receiver, sender = ends
+    overflow(sender)
+    monkeypatch.setattr(one_way, "REST", 0.0)
+    sender.post(b"next")
+    monkeypatch.setattr(one_way, "REST", 2 * PATIENCE)
+    posting = background(lambda: sender.post(b"last"))
+    posting.join(PATIENCE)
+    assert not posting.is_alive()
+    assert drain(receiver)[-2:] == [b"next", b"last"]
 
 
 def test_small_and_large_messages_share_the_room(ends: Ends) -> None:
@@ -310,7 +391,7 @@ def test_a_reader_of_another_host_finds_an_unannounced_message(
 
 
 def test_the_dealer_of_a_queue_finds_an_unannounced_item() -> None:
-    inbox, outbox = local.one_way_pair()
+    inbox, outbox = one_way.pair()
     arrivals, door = LocalChannel.pair()
     Dealer(inbox, arrivals).start()
     reader = queue_delivery.become_reader(door)
@@ -492,7 +573,7 @@ def test_a_process_killed_within_the_backlog_leaves_it_to_others() -> None:
 
 
 def test_threads_keep_their_own_order() -> None:
-    receiver, sender = local.one_way_pair()
+    receiver, sender = one_way.pair()
 
     def send_all(who: int) -> None:
         for number in range(2000):

@@ -20,14 +20,14 @@ import pytest
 import fiber
 from census import wait_until
 from fiber import queues
-from fiber._hub import local, queue_delivery
+from fiber._hub import local, one_way, queue_delivery
 from fiber._hub.queue_delivery import Feeder, ItemCount
 from fiber._wire import packet
 from patience import PATIENCE
 from unit.interrupting import INSTRUCTIONS, is_interrupted
 
-MORE_THAN_FITS = 3000
-"""Items that no socket's buffer holds."""
+MORE_THAN_FITS = 10_000
+"""Items that neither a socket nor its backlog holds."""
 
 
 def start(target: Callable[..., Any], *args: Any) -> fiber.Process:
@@ -71,7 +71,7 @@ def test_a_place_that_is_given_back_twice_is_removed() -> None:
 
 def test_an_interrupted_get_frees_the_place_of_its_item() -> None:
     queue: Any = fiber.Queue(1)
-    modules = (queues, queue_delivery, local, packet)
+    modules = (queues, queue_delivery, local, one_way, packet)
     files = {str(module.__file__) for module in modules}
     for stop in itertools.count():
         queue.put(1)

@@ -27,7 +27,8 @@ from fiber._agent.agent import Agent
 from fiber._hub import handles, hub, queue_delivery, registry, remote
 from fiber._hub.client import HubStream, ObjectUnreachable
 from fiber._hub.handles import GrantSet
-from fiber._hub.local import LocalChannel, QuietSocket
+from fiber._hub.local import QuietSocket
+from fiber._hub.one_way import SendingEnd
 from fiber._hub.protocol import NO_SECRET, ONE, SECRET, Op
 from fiber._runtime import state
 from fiber._sync import semaphore as shared_semaphore
@@ -73,8 +74,8 @@ def once(interrupt: Callable[[], Any], function: Callable[..., Any]) -> Callable
 
 def test_a_put_within_a_put_of_the_same_queue(monkeypatch: pytest.MonkeyPatch) -> None:
     queue: Any = fiber.Queue()
-    send = once(lambda: queue.put("inner"), LocalChannel.try_send)
-    monkeypatch.setattr(LocalChannel, "try_send", send)
+    send = once(lambda: queue.put("inner"), SendingEnd.try_send_directly)
+    monkeypatch.setattr(SendingEnd, "try_send_directly", send)
     without_deadlock(lambda: queue.put("outer"))
     assert {queue.get(), queue.get()} == {"inner", "outer"}
 
@@ -110,7 +111,7 @@ def test_ctrl_c_at_any_step_of_a_put_costs_no_place_and_no_join(
     make: Callable[[int], Any], fed: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if fed:
-        monkeypatch.setattr(LocalChannel, "can_try_send", False)
+        monkeypatch.setattr(SendingEnd, "can_try_send", False)
         monkeypatch.setattr(queue_delivery.Feeder, "_start_thread", lambda _: None)
     files = {queues.__file__, queue_delivery.__file__, channels.__file__}
 

@@ -25,15 +25,8 @@ from typing import Any, NamedTuple, Protocol, Self, TypeAlias
 from fiber._hub import client
 from fiber._hub.client import HubStream, ObjectUnreachable
 from fiber._hub.heap import Block, block_of
-from fiber._hub.local import (
-    ENDS,
-    Backlog,
-    LocalChannel,
-    LocalCounter,
-    OneWayEnd,
-    ReceivingEnd,
-    SendingEnd,
-)
+from fiber._hub.local import LocalChannel, LocalCounter
+from fiber._hub.one_way import ENDS, Backlog, OneWayEnd, ReceivingEnd, SendingEnd
 from fiber._hub.protocol import (
     FOUR,
     GRANTING,

@@ -18,7 +18,8 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
-from fiber._hub.local import LOOK_AGAIN, LocalChannel, LocalCounter, ReceivingEnd
+from fiber._hub.local import LocalChannel, LocalCounter
+from fiber._hub.one_way import LOOK_AGAIN, ReceivingEnd, SendingEnd
 from fiber._hub.protocol import Doorbell, Status
 from fiber._hub.streams import EDGE, IN, OUT, Poller
 from fiber._sync.semaphore import COUNTING, SLICE, Abandoned, SharedBlock, SharedSemaphore, warn_of
@@ -137,7 +138,7 @@ class HostedChannel:
             waiter, messages = self._senders[0]
             try:
                 while messages:
-                    if not self._channel.try_send(*messages[0]):
+                    if not self._try_send(*messages[0]):
                         return
                     messages.popleft()
             except BrokenPipeError:
@@ -146,6 +147,9 @@ class HostedChannel:
                 status = Status.OK
             self._senders.popleft()
             waiter.answer(status, 1)
+
+    def _try_send(self, payload: BytesLike, buffers: Sequence[memoryview]) -> bool:
+        return self._channel.try_send(payload, buffers)
 
     def _serve_receivers(self) -> None:
         while self._receivers:
@@ -173,6 +177,41 @@ class HostedChannel:
             watchers, self._watchers = self._watchers, set()
             for watcher in watchers:
                 watcher()
+
+
+class HostedSender(HostedChannel):
+    """Sending end of a one-way channel.
+
+    As a local ``post`` does, it waits for the socket as long as receivers make room there.
+    """
+
+    _channel: SendingEnd
+
+    def __init__(self, loop: Loop, poller: Poller, channel: SendingEnd) -> None:
+        super().__init__(poller, channel)
+        self._loop = loop
+        self._is_waiting = False
+
+    def close(self) -> None:
+        """Stop serving the channel, and close it."""
+        self._senders.clear()
+        super().close()
+
+    def _try_send(self, payload: BytesLike, buffers: Sequence[memoryview]) -> bool:
+        if self._channel.try_send_directly(payload, buffers):
+            return True
+        patience = self._channel.patience()
+        if not patience:
+            return self._channel.try_send(payload, buffers)
+        if not self._is_waiting:
+            self._is_waiting = True
+            self._loop.call_later(patience, self._try_again)
+        return False
+
+    def _try_again(self) -> None:
+        self._is_waiting = False
+        if self._senders:
+            self._event(OUT)
 
 
 class HostedReceiver(HostedChannel):

@@ -33,17 +33,11 @@ from fiber._hub.hosted import (
     HostedMemory,
     HostedReceiver,
     HostedSemaphore,
+    HostedSender,
     HostedWaitList,
 )
-from fiber._hub.local import (
-    ENDS,
-    Backlog,
-    LocalChannel,
-    LocalCounter,
-    QuietSocket,
-    ReceivingEnd,
-    without_timeout,
-)
+from fiber._hub.local import LocalChannel, LocalCounter, QuietSocket, without_timeout
+from fiber._hub.one_way import ENDS, Backlog, ReceivingEnd
 from fiber._hub.protocol import Doorbell, HubAddress, ObjectKind
 from fiber._hub.registry import Hosted, Registry, SharedObject
 from fiber._hub.replicas import MemoryLink, Replicas
@@ -253,7 +247,7 @@ class Hub:
             end = ENDS[shared.kind](fd, Backlog(block_of(segment, *shared.extent)))
             if isinstance(end, ReceivingEnd):
                 return HostedReceiver(self.loop, self._poller, end)
-            return HostedChannel(self._poller, end)
+            return HostedSender(self.loop, self._poller, end)
         if shared.kind is ObjectKind.SEMAPHORE:
             return HostedSemaphore(self.loop, self.doorbell, block_of(fd, *shared.extent))
         if shared.kind is ObjectKind.WAIT_LIST:

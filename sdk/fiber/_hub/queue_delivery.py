@@ -31,10 +31,11 @@ from queue import SimpleQueue
 from typing import Any
 
 from fiber._exceptions import report_uncaught
-from fiber._hub import local, shared_blocks
+from fiber._hub import one_way, shared_blocks
 from fiber._hub.client import ObjectUnreachable
 from fiber._hub.handles import collecting_grants
-from fiber._hub.local import LocalChannel, LocalCounter, ReceivingEnd, SendingEnd
+from fiber._hub.local import LocalChannel, LocalCounter
+from fiber._hub.one_way import ReceivingEnd, SendingEnd
 from fiber._hub.remote import RemoteChannel, RemoteCounter, RemoteObject
 from fiber._hub.shared_blocks import AnySemaphore, AnyWaitList
 from fiber._sync.semaphore import COUNTING
@@ -252,7 +253,7 @@ class Feeder:
     def _send_now(self, payload: bytes, buffers: list[memoryview]) -> bool:
         self._slots.sending()
         try:
-            if self._outbox.try_send(payload, buffers):
+            if self._outbox.try_send_directly(payload, buffers):
                 self._slots.sent()
                 return True
         except OSError:
@@ -510,7 +511,7 @@ class Dealer:
         timeout = None
         if self._item is None:
             poller.register(self._inbox.fileno(), select.POLLIN)
-            timeout = local.LOOK_AGAIN * 1000
+            timeout = one_way.LOOK_AGAIN * 1000
         else:
             for reader in self._readers:
                 poller.register(reader.fileno(), reader.room_events)
@@ -524,7 +525,7 @@ class Dealer:
             answer: Channel = packet.loads(message)
         except Exception:  # the reader has ended already
             return
-        readers_end, dealers_end = local.one_way_pair()
+        readers_end, dealers_end = one_way.pair()
         with collecting_grants(reusable=False) as grants:
             invitation = pickle.dumps(readers_end)
         try:

@@ -211,7 +211,7 @@ class RemoteChannel(RemoteObject):
         """Send one message as ``send`` does, which only waits until the hub has it."""
         self.send(payload, buffers)
 
-    def try_send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
+    def try_send_directly(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
         """Return False: to find out whether there is room takes as long as to send."""
         return False
 

@@ -104,13 +104,13 @@ class SharedChannel(Channel, Protocol):
 
     @property
     def can_try_send(self) -> bool:
-        """True if ``try_send`` can succeed."""
+        """True if ``try_send_directly`` can succeed."""
 
     def post(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
         """Send one message, waiting for room but not until it is read."""
 
-    def try_send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
-        """Send one message if there is room for it now."""
+    def try_send_directly(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
+        """Send one message if there is room for it now, and no other message waits for some."""
 
     def recv_counting(self, counter: Any, *, wait: bool) -> Message | None:
         """Receive a message and raise ``counter``, a ``SharedCounter`` of the same host.
@@ -422,11 +422,11 @@ class UnixCounter:
         self._owner.close()
 
 
-def wait_until(fd: int, events: int) -> None:
-    """Wait for one of ``events`` of ``fd``, or for its end."""
+def wait_until(fd: int, events: int, timeout: float | None = None) -> bool:
+    """Wait for one of ``events`` of ``fd``, or for its end; return False after ``timeout`` s."""
     poller = select.poll()
     poller.register(fd, events)
-    poller.poll()
+    return bool(poller.poll(None if timeout is None else timeout * 1000))
 
 
 def wait_readable(fd: int, timeout: float | None) -> bool:

@@ -12,7 +12,7 @@ Layout (little endian)::
                         then payload and buffers, here or (IN_MEMFD) in the first descriptor
     kind:u8 = PASSED    the same, then the offset of each in the first descriptor:u64 (0 for the
                         payload: here); they came from another host and lie where they arrived
-    kind:u8 = WAKE_UP   no message: a backlog has messages (``fiber._hub.local``)
+    kind:u8 = WAKE_UP   no message: a backlog has messages (``fiber._hub.one_way``)
 
 Buffers are pickle protocol 5's out-of-band buffers (PEP 574).
 """
