@@ -38,6 +38,9 @@ from fiber._backends.main_module import is_inside, is_installed, main_file, star
 LOOSE = "program"
 """Folder on the other machine for modules that are sent without the folder around them."""
 
+_ALL_PLACES = ""
+"""Folder on the other machine that holds all places."""
+
 
 class Places(dict[str, str]):
     """Local folders and files, none within another, and their names on the other machine."""
@@ -123,7 +126,7 @@ def find_layout(
         tuple(dict.fromkeys(tree for tree in path if _is_tree(tree, places))),
         _session(here).intersection(places) if main is None else frozenset(),
         ProgramPaths(
-            *_search_path(places, path),
+            *_search_path(places, path, modules),
             directory=(is_inside(here, program_folder) and places.name_of(here))
             or places.name_of(program_folder)
             or LOOSE,
@@ -145,11 +148,22 @@ def _folder_of(main: str) -> str:
     return folder
 
 
-def _search_path(places: Places, path: list[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the entries of the other machine's ``sys.path``, before and after the library."""
+def _search_path(
+    places: Places, path: list[str], modules: Iterable[_ImportedModule]
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the entries of the other machine's ``sys.path``, before and after the library.
+
+    A package may itself be a place, such as that of a script which lies in its own package.  Then
+    the folder of all places stands for the folder around the package.
+    """
+    around = {os.path.dirname(each.whole) for each in modules if _is_place(each, places)}
 
     def there(entries: list[str]) -> list[str]:
-        names = [places.name_of(entry) for entry in entries if not is_installed(entry)]
+        names = [
+            _ALL_PLACES if entry in around else places.name_of(entry)
+            for entry in entries
+            if not is_installed(entry)
+        ]
         return [name for name in names if name is not None]
 
     library = sysconfig.get_path("stdlib")
@@ -158,6 +172,10 @@ def _search_path(places: Places, path: list[str]) -> tuple[tuple[str, ...], tupl
     if any(name.startswith(f"{LOOSE}/") for name in places.values()):
         before.append(LOOSE)
     return tuple(before), tuple(after)
+
+
+def _is_place(module: _ImportedModule, places: Places) -> bool:
+    return places.get(module.whole) == module.name
 
 
 def _is_offered(folder: str) -> bool:
