@@ -15,8 +15,8 @@ the socket are older than those in the backlog::
   end.  With it the receiver sends the packet again and wakes the next receiver.
 * A sender that checked the backlog a moment too early may send behind the wake-up packet.  It notes
   that (``AMBIGUOUS``), and the next receiver moves the packet to the end.
-* The backlog is slower than the socket.  So the sender of a queue is *patient*: it waits for room in
-  the socket as long as receivers make some.  ``SimpleQueue`` and ``Pipe`` do not wait.
+* The backlog is slower than the socket.  So the sender of a queue is *patient*: it waits for room
+  in the socket as long as receivers make some.  ``SimpleQueue`` and ``Pipe`` do not wait.
 * A sender that finds the backlog full waits for a packet in the other direction.
 * If a receiver dies while it has the wake-up packet, no message is lost, but other receivers do not
   wake.  They look at the backlog each second; the hub and the dealer of a queue do so for their
@@ -249,9 +249,10 @@ class SendingEnd(OneWayEnd):
         before that.
         """
         head, now = self._words[HEAD], time.monotonic()
-        if self._stuck is None or self._stuck[0] != head:
-            self._stuck = head, now
-        left = max(0.0, self._stuck[1] + REST - now)
+        stuck = self._stuck  # another thread may set it meanwhile
+        if stuck is None or stuck[0] != head:
+            self._stuck = stuck = head, now
+        left = max(0.0, stuck[1] + REST - now)
         return left if self._room_events else min(left, _LOOK_AT_HEAD)
 
     def try_send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
@@ -439,8 +440,9 @@ class ReceivingEnd(OneWayEnd):
                 raising = None if counter is None else counter.raising
                 record = self.backlog.take(self._say_room, raising)
                 return Message(memoryview(record), [], [])
+            expected = None if head == _IS_WAKE_UP else counter
             try:
-                message = self._receive(counter, wait=False)
+                message = self._receive(expected, wait=False)
             except packet.WakeUp as wake_up:
                 # Another receiver may have been faster.  The last record needs no wake-up packet.
                 sender = wake_up.sender
@@ -451,6 +453,8 @@ class ReceivingEnd(OneWayEnd):
             except (BlockingIOError, ConnectionClosed):
                 pass  # another receiver has taken the message
             else:
+                if expected is None and counter is not None:
+                    counter.raising()  # another receiver has taken the wake-up packet
                 if sender is not None:
                     self._pass_on(sender)
                 return message
