@@ -11,6 +11,7 @@ import select
 import signal
 import threading
 from collections.abc import Callable, Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -211,52 +212,101 @@ def test_a_bounded_queue_gives_back_the_place_of_each_item_of_its_backlog() -> N
     putter.join_thread()
     assert queue.full()
     assert [queue.get() for _ in range(MORE_THAN_A_SOCKET)] == [*range(MORE_THAN_A_SOCKET)]
-    assert queue.qsize() == 0
+    assert queue._slots._free.value() == MORE_THAN_A_SOCKET
     assert queue.empty()
 
 
 # ``post``, by which a queue sends
 
 
-def test_a_message_waits_for_the_socket_while_receivers_make_room(
-    ends: Ends, monkeypatch: pytest.MonkeyPatch
+class Clock:
+    """Time for a sender.  It goes on by what the sender sleeps, and ``naps`` has those times."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now = 1000.0
+        self.naps: list[float] = []
+        self.at_a_nap: Callable[[], object] = lambda: None
+        time = SimpleNamespace(monotonic=lambda: self.now, sleep=self.nap)
+        monkeypatch.setattr(one_way, "time", time)
+        monkeypatch.setattr(one_way, "wait_until", lambda _fd, _events, seconds: self.nap(seconds))
+
+    def nap(self, seconds: float) -> None:
+        self.naps.append(seconds)
+        self.now += seconds
+        self.at_a_nap()
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    return Clock(monkeypatch)
+
+
+def in_the_backlog(ends: Ends) -> int:
+    """Return the number of bytes that the backlog has ever had."""
+    return int(ends[0].backlog.words[one_way.TAIL])
+
+
+def test_a_message_goes_through_the_socket_if_receivers_soon_make_room(
+    ends: Ends, clock: Clock
 ) -> None:
-    monkeypatch.setattr(one_way, "REST", PATIENCE)
     receiver, sender = ends
     held = filled(lambda: sender.try_send_directly(b"first"))
-    posting = background(lambda: sender.post(b"last"))
-    assert [receiver.recv().tobytes() for _ in range(held)] == [b"first"] * held
-    posting.join(PATIENCE)
-    assert receiver.recv().tobytes() == b"last"
-    assert not receiver.backlog.words[one_way.TAIL], "it went through the backlog"
+    clock.at_a_nap = receiver.recv
+    sender.post(b"last")
+    assert clock.naps == pytest.approx([one_way.PATIENCE])
+    assert drain(receiver) == [b"first"] * (held - 1) + [b"last"]
+    assert not in_the_backlog(ends)
 
 
-def test_a_message_waits_until_receivers_have_emptied_the_backlog(
-    ends: Ends, monkeypatch: pytest.MonkeyPatch
+def test_a_message_goes_through_the_socket_if_receivers_soon_empty_the_backlog(
+    ends: Ends, clock: Clock
 ) -> None:
     receiver, sender = ends
     overflow(sender)
-    end = receiver.backlog.words[one_way.TAIL]
-    monkeypatch.setattr(one_way, "REST", PATIENCE)
-    posting = background(lambda: sender.post(b"last"))
-    assert len(drain(receiver)) >= MORE_THAN_A_SOCKET
-    posting.join(PATIENCE)
-    assert not posting.is_alive()
-    assert receiver.backlog.words[one_way.TAIL] == end, "it went into the backlog"
+    before, taken = in_the_backlog(ends), []
+    clock.at_a_nap = lambda: taken.extend(drain(receiver))
+    sender.post(b"last")
+    assert len(clock.naps) == 1
+    assert taken == numbers(MORE_THAN_A_SOCKET)
+    assert drain(receiver) == [b"last"]
+    assert in_the_backlog(ends) == before
 
 
-def test_a_sender_waits_once_for_receivers_that_are_at_rest(
-    ends: Ends, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_slow_receiver_makes_a_sender_wait_once_in_a_while(ends: Ends, clock: Clock) -> None:
     receiver, sender = ends
     overflow(sender)
-    monkeypatch.setattr(one_way, "REST", 0.0)
-    sender.post(b"next")
-    monkeypatch.setattr(one_way, "REST", 2 * PATIENCE)
-    posting = background(lambda: sender.post(b"last"))
-    posting.join(PATIENCE)
-    assert not posting.is_alive()
-    assert drain(receiver)[-2:] == [b"next", b"last"]
+    clock.at_a_nap = receiver.recv
+    sender.post(b"waits")
+    assert sum(clock.naps) == pytest.approx(one_way.PATIENCE)
+    clock.naps.clear()
+    for _ in range(100):
+        sender.post(b"does not wait")
+    assert not clock.naps
+    clock.now += one_way.HURRY
+    sender.post(b"waits again")
+    assert sum(clock.naps) == pytest.approx(one_way.PATIENCE)
+    assert drain(receiver)[-102:] == [b"waits", *[b"does not wait"] * 100, b"waits again"]
+
+
+def test_a_sender_of_another_host_does_not_wait_for_an_empty_backlog(far: Far) -> None:
+    queue: Any = fiber.SimpleQueue()
+    there = far(queue)
+    for _ in range(MORE_THAN_A_SOCKET):
+        queue.put("here")
+    busy, done = threading.Event(), threading.Event()
+
+    def keep_full() -> None:
+        while not done.is_set():
+            queue.put(queue.get())
+            busy.set()
+
+    keeper = background(keep_full)
+    assert busy.wait(PATIENCE)
+    sender = background(there.put, "there")
+    sender.join(PATIENCE)
+    done.set()
+    keeper.join(PATIENCE)
+    assert not sender.is_alive()
 
 
 def test_small_and_large_messages_share_the_room(ends: Ends) -> None:

@@ -40,7 +40,7 @@ from fiber._hub.protocol import (
 )
 from fiber._hub.registry import NoSuchObject, Registry
 from fiber._hub.remote import RemoteChannel, RemoteCounter, RemoteEnd, RemoteObject
-from fiber._transport.channels import SharedChannel, SharedCounter, UnixChannel, UnixCounter
+from fiber._transport.channels import Channel, SharedCounter, UnixChannel, UnixCounter
 from fiber._wire.descriptor import Descriptor, own
 
 
@@ -118,7 +118,7 @@ class EndHandle(NamedTuple):
     """Segment of the block; None if the hub keeps it together with the socket."""
     extent: Extent
 
-    def end(self) -> SharedChannel:
+    def end(self) -> Channel:
         """Return the end for the process that unpickled the handle."""
         if isinstance(self.socket, HubHandle) and not self.socket.is_local():
             return RemoteEnd(self.kind, self.extent, *self.socket)
@@ -135,7 +135,7 @@ def _descriptors(handle: Handle) -> list[Descriptor]:
 # Unpickling
 
 
-def channel(handle: Handle | EndHandle) -> SharedChannel:
+def channel(handle: Handle | EndHandle) -> Channel:
     """Return the channel of an unpickled handle."""
     if isinstance(handle, EndHandle):
         return handle.end()

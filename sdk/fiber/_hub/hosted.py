@@ -14,6 +14,7 @@ from __future__ import annotations
 import contextlib
 import os
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Protocol
@@ -49,6 +50,8 @@ class HostedChannel:
         self._poller = poller
         self._channel = channel
         self._senders: deque[tuple[Waiter, deque[Parts]]] = deque()
+        self._events = 0
+        """Event after which to try again to send; 0 if there is none."""
         self._receivers: deque[Waiter] = deque()
         self._pollers: deque[Waiter] = deque()
         self._watchers: set[Callable[[], None]] = set()
@@ -119,7 +122,7 @@ class HostedChannel:
     def _watch(self) -> None:
         mask = IN if self._is_awaited() else 0
         if self._senders:
-            mask |= self._channel.room_events
+            mask |= self._events
         self._poller.watch(self._channel.fileno(), mask, self._event)
 
     def _is_awaited(self) -> bool:
@@ -149,7 +152,9 @@ class HostedChannel:
             waiter.answer(status, 1)
 
     def _try_send(self, payload: BytesLike, buffers: Sequence[memoryview]) -> bool:
-        return self._channel.try_send(payload, buffers)
+        sent = self._channel.try_send(payload, buffers)
+        self._events = self._channel.room_events
+        return sent
 
     def _serve_receivers(self) -> None:
         while self._receivers:
@@ -180,17 +185,16 @@ class HostedChannel:
 
 
 class HostedSender(HostedChannel):
-    """Sending end of a one-way channel.
-
-    As a local ``post`` does, it waits for the socket as long as receivers make room there.
-    """
+    """Sending end of a one-way channel, a patient sender (see ``one_way``)."""
 
     _channel: SendingEnd
 
     def __init__(self, loop: Loop, poller: Poller, channel: SendingEnd) -> None:
         super().__init__(poller, channel)
         self._loop = loop
-        self._is_waiting = False
+        self._begin: float | None = None
+        """Time of the first attempt to send the next message."""
+        self._is_timed = False
 
     def close(self) -> None:
         """Stop serving the channel, and close it."""
@@ -198,18 +202,26 @@ class HostedSender(HostedChannel):
         super().close()
 
     def _try_send(self, payload: BytesLike, buffers: Sequence[memoryview]) -> bool:
-        if self._channel.try_send_directly(payload, buffers):
-            return True
-        patience = self._channel.patience()
-        if not patience:
-            return self._channel.try_send(payload, buffers)
-        if not self._is_waiting:
-            self._is_waiting = True
-            self._loop.call_later(patience, self._try_again)
-        return False
+        sent = self._channel.try_send_directly(payload, buffers)
+        if not sent:
+            self._begin = self._begin or time.monotonic()
+            self._events, patience = self._channel.patience(self._begin)
+            if patience:
+                self._try_again_after(patience)
+                return False
+            sent = self._channel.try_send(payload, buffers)
+            self._events = self._channel.room_events
+        if sent:
+            self._begin = None
+        return sent
+
+    def _try_again_after(self, seconds: float) -> None:
+        if not self._is_timed:
+            self._is_timed = True
+            self._loop.call_later(seconds, self._try_again)
 
     def _try_again(self) -> None:
-        self._is_waiting = False
+        self._is_timed = False
         if self._senders:
             self._event(OUT)
 

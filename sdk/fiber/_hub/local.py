@@ -20,7 +20,6 @@ from fiber._transport.loop import LONGEST_POLL
 from fiber._wire import packet
 from fiber._wire.descriptor import Descriptor
 from fiber._wire.memory_files import BytesLike
-from fiber._wire.packet import Message
 
 _Socket = TypeVar("_Socket", bound=socket.socket)
 
@@ -50,12 +49,6 @@ class LocalChannel(UnixChannel):
 
     __slots__ = ()
 
-    can_try_send = True
-
-    def post(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
-        """Send one message.  Wait for room, but not until a bulky message is read."""
-        packet.send(self._sock, payload, buffers, ballast=True)
-
     def try_send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
         """Send one message if there is room for it now."""
         # O_NONBLOCK would not do: all holders of the socket share it.
@@ -71,8 +64,6 @@ class LocalChannel(UnixChannel):
         except BlockingIOError:
             return False
         return True
-
-    try_send_directly = try_send
 
     def post_within(self, payload: BytesLike, seconds: float) -> bool:
         """Send one message if there is room for it within ``seconds``."""
@@ -91,20 +82,6 @@ class LocalChannel(UnixChannel):
 
     def confirm(self) -> None:
         """Do nothing: the object is on this host."""
-
-    def recv_counting(self, counter: LocalCounter, *, wait: bool) -> Message | None:
-        """Receive a message and raise ``counter`` in one step; None if there is no message."""
-        try:
-            return packet.receive(self._sock, wait=wait, then=counter.raising)
-        except BlockingIOError:
-            return None
-
-    def recv_uncounting(self, counter: LocalCounter, *, wait: bool) -> Message | None:
-        """Receive a message and lower ``counter``; None if there is no message."""
-        message = self.recv() if wait else self.try_recv()
-        if message is not None:
-            counter.take(0)
-        return message
 
     @property
     def room_events(self) -> int:

@@ -15,8 +15,9 @@ the socket are older than those in the backlog::
   end.  With it the receiver sends the packet again and wakes the next receiver.
 * A sender that checked the backlog a moment too early may send behind the wake-up packet.  It notes
   that (``AMBIGUOUS``), and the next receiver moves the packet to the end.
-* The backlog is slower than the socket.  So the sender of a queue is *patient*: it waits for room
-  in the socket as long as receivers make some.  ``SimpleQueue`` and ``Pipe`` do not wait.
+* The backlog is slower than the socket.  So two kinds of senders are *patient*, and wait a moment
+  for room in the socket first: the thread that sends the items of a queue, and the hub, which sends
+  for other hosts.
 * A sender that finds the backlog full waits for a packet in the other direction.
 * If a receiver dies while it has the wake-up packet, no message is lost, but other receivers do not
   wake.  They look at the backlog each second; the hub and the dealer of a queue do so for their
@@ -62,10 +63,13 @@ UNANNOUNCED = 12
 ROOM = 13
 """Word: the usual size of the socket's buffer."""
 
-REST = 0.05
-"""Seconds without a message received after which a patient sender uses the backlog."""
+PATIENCE = 0.05
+"""Seconds that a patient sender waits for the socket before a message goes into the backlog."""
 
-_LOOK_AT_HEAD = 1e-3
+HURRY = 1.0
+"""Seconds after that in which it does not wait again, unless the backlog is empty before."""
+
+_LOOK_AT_BACKLOG = 1e-3
 """Seconds between two looks of a patient sender while receivers empty the backlog."""
 
 _HEADER = 128
@@ -197,15 +201,16 @@ class OneWayEnd(LocalChannel):
 class SendingEnd(OneWayEnd):
     """Sending end of a one-way channel."""
 
-    __slots__ = ("_room_events", "_stuck")
+    __slots__ = ("_hurries_until", "_room_events")
 
     kind = ObjectKind.SENDER
+    can_try_send = True
 
     def __init__(self, owner: Descriptor, backlog: Backlog) -> None:
         super().__init__(owner, backlog)
         self._room_events: int = select.POLLOUT
-        self._stuck: tuple[int, float] | None = None
-        """Head of the backlog, and the time, when receivers last made no room in the socket."""
+        self._hurries_until = 0.0
+        """Time until which messages go into the backlog at once."""
 
     def send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
         """Send one message.  Wait for room; after a bulky message, wait until it is read."""
@@ -221,39 +226,40 @@ class SendingEnd(OneWayEnd):
     def post(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
         """Send one message.  Wait for room, but not until it is read.
 
-        The socket is faster than the backlog.  So this waits for room in the socket as long as
-        receivers make some.
+        The sender is patient: it first waits a moment for room in the socket.
         """
+        begin = time.monotonic()
         while not self.try_send_directly(payload, buffers):
-            patience = self.patience()
+            events, patience = self.patience(begin)
             if not patience:
                 self._send_in_turn(payload, buffers)
                 return
-            if self._room_events:
-                wait_until(self.fileno(), self._room_events, patience)
+            if events:
+                wait_until(self.fileno(), events, patience)
             else:
                 time.sleep(patience)
 
     def try_send_directly(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
         """Send one message if there is room for it in the socket, and no backlog."""
         if self._send_now(payload, buffers) is None:
-            self._room_events = 0 if self.backlog else select.POLLOUT
             return False
-        self._stuck = None
+        self._hurries_until = 0.0
         return True
 
-    def patience(self) -> float:
-        """Return after how many seconds to try again to send directly.
+    def patience(self, begin: float) -> tuple[int, float]:
+        """Return when to try again to send a message directly: at an event, or after seconds.
 
-        It is zero if no receiver has received for ``REST`` seconds.  ``room_events`` may come
-        before that.
+        ``begin`` is the time of the first attempt.  Zero seconds mean not to wait any longer.  The
+        event is zero if there is none.
         """
-        head, now = self._words[HEAD], time.monotonic()
-        stuck = self._stuck  # another thread may set it meanwhile
-        if stuck is None or stuck[0] != head:
-            self._stuck = stuck = head, now
-        left = max(0.0, stuck[1] + REST - now)
-        return left if self._room_events else min(left, _LOOK_AT_HEAD)
+        now = time.monotonic()
+        if now < self._hurries_until:
+            return 0, 0.0
+        left = begin + PATIENCE - now
+        if left <= 0:
+            self._hurries_until = now + HURRY
+            return 0, 0.0
+        return (0, min(left, _LOOK_AT_BACKLOG)) if self.backlog else (select.POLLOUT, left)
 
     def try_send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
         """Send one message if there is room for it now."""
@@ -266,7 +272,7 @@ class SendingEnd(OneWayEnd):
 
     @property
     def room_events(self) -> int:
-        """Event of ``fileno()`` after which to try again to send; 0 if there is none."""
+        """Event of ``fileno()`` after which ``try_send`` may succeed."""
         return self._room_events
 
     def _send_now(self, payload: BytesLike, buffers: Sequence[memoryview]) -> bool | None:
@@ -303,8 +309,9 @@ class SendingEnd(OneWayEnd):
         if is_first and not fits:
             return select.POLLOUT
         if not (fits and self.backlog.put(view)):
-            self._forget_room()
+            # In this order: if this process dies in between, receivers send a notice to the others.
             self.backlog.need(packet.size_of(payload, buffers))
+            self._forget_room()
             return select.POLLIN
         if is_first or self._words[UNANNOUNCED] or self._nothing_unread():
             self._words[UNANNOUNCED] = True
@@ -379,6 +386,13 @@ class ReceivingEnd(OneWayEnd):
             if message is not None or not wait:
                 return message
 
+    def recv_uncounting(self, counter: LocalCounter, *, wait: bool) -> Message | None:
+        """Receive a message and lower ``counter``; None if there is no message."""
+        message = self.recv() if wait else self.try_recv()
+        if message is not None:
+            counter.take(0)
+        return message
+
     def _next(
         self, *, wait: bool, passing: bool = False, counter: LocalCounter | None = None
     ) -> Message | None:
@@ -408,13 +422,8 @@ class ReceivingEnd(OneWayEnd):
         self, counter: LocalCounter | None, *, wait: bool, passing: bool = False
     ) -> Message:
         """Receive a packet from the socket; WakeUp if it is a wake-up packet."""
-        if counter is None:
-            return packet.receive(self._sock, wait=wait, passing=passing)
-        try:
-            return packet.receive(self._sock, wait=wait, passing=passing, then=counter.raising)
-        except packet.WakeUp:
-            counter.take(0)  # it was no message
-            raise
+        raised = None if counter is None else counter.fileno()
+        return packet.receive(self._sock, wait=wait, passing=passing, counter=raised)
 
     def _take(
         self, sender: Descriptor | None = None, counter: LocalCounter | None = None
@@ -440,9 +449,8 @@ class ReceivingEnd(OneWayEnd):
                 raising = None if counter is None else counter.raising
                 record = self.backlog.take(self._say_room, raising)
                 return Message(memoryview(record), [], [])
-            expected = None if head == _IS_WAKE_UP else counter
             try:
-                message = self._receive(expected, wait=False)
+                message = self._receive(counter, wait=False)
             except packet.WakeUp as wake_up:
                 # Another receiver may have been faster.  The last record needs no wake-up packet.
                 sender = wake_up.sender
@@ -453,8 +461,6 @@ class ReceivingEnd(OneWayEnd):
             except (BlockingIOError, ConnectionClosed):
                 pass  # another receiver has taken the message
             else:
-                if expected is None and counter is not None:
-                    counter.raising()  # another receiver has taken the wake-up packet
                 if sender is not None:
                     self._pass_on(sender)
                 return message
@@ -504,9 +510,11 @@ def _wake_up(sock: socket.socket, words: memoryview) -> None:
     try:
         packet.send_wake_up(sock, sock.fileno())
         words[UNANNOUNCED] = False
-    except BlockingIOError:
-        pass  # the system does not let the buffer grow
     except ConnectionResetError as error:
         raise BrokenPipeError("the other end is closed") from error
+    except BrokenPipeError:
+        raise
+    except OSError:
+        pass  # the buffer may not grow, or a limit is reached; the next sender tries again
     finally:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, usual // 2)

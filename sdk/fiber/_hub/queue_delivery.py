@@ -39,7 +39,12 @@ from fiber._hub.one_way import ReceivingEnd, SendingEnd
 from fiber._hub.remote import RemoteChannel, RemoteCounter, RemoteObject
 from fiber._hub.shared_blocks import AnySemaphore, AnyWaitList
 from fiber._sync.semaphore import COUNTING
-from fiber._transport.channels import Channel, SharedChannel, SharedCounter
+from fiber._transport.channels import (
+    Channel,
+    ReceivingChannel,
+    SendingChannel,
+    SharedCounter,
+)
 from fiber._wire import bundle, packet
 from fiber._wire.packet import Message
 from fiber.errors import ConnectionClosed
@@ -104,11 +109,11 @@ class QueueSlots:
         """Note that the item was sent: its slot becomes free when it is received."""
         self._claims.drop()
 
-    def put_items(self, outbox: SharedChannel) -> PutItems | None:
+    def put_items(self, outbox: SendingChannel) -> PutItems | None:
         """Return None: each item has a slot, so it is sent alone."""
         return None
 
-    def receive(self, inbox: SharedChannel, *, wait: bool) -> Message | None:
+    def receive(self, inbox: ReceivingChannel, *, wait: bool) -> Message | None:
         """Receive an item and free its slot; None if there is no item."""
         return inbox.recv_counting(self._free, wait=wait)
 
@@ -164,13 +169,13 @@ class ItemCount:
     def sent(self) -> None:
         """Do nothing: ``sending`` has counted the item."""
 
-    def put_items(self, outbox: SharedChannel) -> PutItems | None:
+    def put_items(self, outbox: SendingChannel) -> PutItems | None:
         """Return a function that sends and counts items in one request to another host."""
         if isinstance(outbox, RemoteChannel) and isinstance(self._sent, RemoteCounter):
             return partial(outbox.put_items, counter=self._sent)
         return None
 
-    def receive(self, inbox: SharedChannel, *, wait: bool) -> Message | None:
+    def receive(self, inbox: ReceivingChannel, *, wait: bool) -> Message | None:
         """Receive an item and lower the count; None if there is no item."""
         return inbox.recv_uncounting(self._sent, wait=wait)
 
@@ -196,7 +201,7 @@ class Feeder:
     def __init__(
         self,
         owner: Any,
-        outbox: SharedChannel,
+        outbox: SendingChannel,
         slots: QueueSlots | ItemCount,
         *,
         on_error: Callable[[Exception, Any], None],

@@ -160,7 +160,7 @@ class RemoteObject:
 
 
 class RemoteChannel(RemoteObject):
-    """End of a message pipe on another host; a ``SharedChannel``."""
+    """End of a message pipe on another host; a ``SendingChannel`` and a ``ReceivingChannel``."""
 
     can_try_send = False
 

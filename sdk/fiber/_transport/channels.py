@@ -99,8 +99,8 @@ class Counter(Protocol):
         """Close this holder's end of the counter."""
 
 
-class SharedChannel(Channel, Protocol):
-    """Channel that a queue can use, because it can send without waiting."""
+class SendingChannel(Channel, Protocol):
+    """Channel by which a queue sends its items."""
 
     @property
     def can_try_send(self) -> bool:
@@ -111,6 +111,10 @@ class SharedChannel(Channel, Protocol):
 
     def try_send_directly(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
         """Send one message if there is room for it now, and no other message waits for some."""
+
+
+class ReceivingChannel(Channel, Protocol):
+    """Channel by which a queue receives its items."""
 
     def recv_counting(self, counter: Any, *, wait: bool) -> Message | None:
         """Receive a message and raise ``counter``, a ``SharedCounter`` of the same host.

@@ -88,6 +88,9 @@ _ANCILLARY_ONE = socket.CMSG_SPACE(_FD.size)
 
 
 _CALL: Callable[[Callable[[], Any]], Any] = operator.call
+_FIRST: Callable[[bytearray], int] = operator.itemgetter(0)
+_UNITS = bytes(int(kind != WAKE_UP) for kind in range(256))
+"""Number of messages in a packet, by its kind."""
 _Ancillary: TypeAlias = list[tuple[int, int, bytes]]
 _Arguments: TypeAlias = tuple[tuple[bytearray], int, int]
 """Arguments of ``recvmsg_into``."""
@@ -428,7 +431,7 @@ def receive(
     descriptors: bool = False,
     wait: bool = True,
     passing: bool = False,
-    then: Callable[[], None] | None = None,
+    counter: int | None = None,
 ) -> Message:
     """Receive one packet; ConnectionClosed if no process can ever send again.
 
@@ -436,15 +439,15 @@ def receive(
     ``descriptors`` makes room for descriptors that the sender attached; without it only the memfd
     of a large message is taken.  ``passing`` says that the caller passes the message on or copies
     it soon: a large one then stays in the sender's memory, which the sender does not reuse until
-    then.  ``then`` is a C function, called as soon as there is a packet: no signal's handler runs
-    in between.
+    then.  ``counter`` is an eventfd that is raised by one as soon as there is a message: no
+    signal's handler runs in between.
     """
     space = _ANCILLARY if descriptors else _ANCILLARY_ONE
     free = _buffers.free
     buffer = free.pop() if free else _ReceiveBuffer()
     try:
         flags = _CLOEXEC if wait else _DONTWAIT
-        received = _recvmsg(sock, ((buffer.data,), space, flags), then)
+        received = _recvmsg(sock, ((buffer.data,), space, flags), counter)
     except OSError:
         free.append(buffer)
         raise
@@ -457,24 +460,27 @@ def receive(
     return _receive_parts(buffer, received, passing=passing)
 
 
-def _recvmsg(
-    sock: socket.socket, arguments: _Arguments, then: Callable[[], None] | None = None
-) -> _Received:
+def _recvmsg(sock: socket.socket, arguments: _Arguments, counter: int | None = None) -> _Received:
     try:
-        return _recvmsg_once(sock, arguments, then)
+        return _recvmsg_once(sock, arguments, counter)
     except ConnectionResetError:
         # The peer closed before it had read all packets of this side.  The kernel reports that
         # once, before it delivers the peer's packets.  The next call returns these, or the end.
-        return _recvmsg_once(sock, arguments, then)
+        return _recvmsg_once(sock, arguments, counter)
 
 
-def _recvmsg_once(
-    sock: socket.socket, arguments: _Arguments, then: Callable[[], None] | None
-) -> _Received:
-    if then is None:
+def _recvmsg_once(sock: socket.socket, arguments: _Arguments, counter: int | None) -> _Received:
+    if counter is None:
         return sock.recvmsg_into(*arguments)
-    # Both calls are one step of the interpreter: no signal's handler runs in between.
-    steps: list[Callable[[], Any]] = [partial(sock.recvmsg_into, *arguments), then]
+    # All calls are one step of the interpreter: no signal's handler runs in between.
+    buffers = arguments[0]
+    buffers[0][0] = WAKE_UP  # the end is no message either
+    kinds = map(_FIRST, buffers)
+    counting = map(os.eventfd_write, (counter,), map(_UNITS.__getitem__, kinds))
+    steps: list[Callable[[], Any]] = [
+        partial(sock.recvmsg_into, *arguments),
+        partial(next, counting),
+    ]
     received: _Received
     received, _ = map(_CALL, steps)
     return received
