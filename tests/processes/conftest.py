@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 
 from faults.runtime import BACKENDS, running_on
+from fiber._hub import one_way
+from processes.one_way_ends import Ends
 
 
 @pytest.fixture(scope="module", params=BACKENDS)
@@ -21,3 +23,12 @@ def only_this_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """No cluster is configured, and no other test's programs are seen."""
     monkeypatch.setenv("KUBECONFIG", str(tmp_path / "none"))
     monkeypatch.setenv("FIBER_RUNTIME_DIRECTORY", str(tmp_path))
+
+
+@pytest.fixture
+def ends() -> Iterator[Ends]:
+    """The receiving and the sending end of a new one-way channel."""
+    receiver, sender = one_way.pair()
+    yield receiver, sender
+    receiver.close()
+    sender.close()

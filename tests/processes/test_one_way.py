@@ -1,17 +1,14 @@
-"""Channels in one direction: how much a pipe or queue holds unread, and which reader gets it."""
+"""Channels in one direction: which reader gets a message, and what a death leaves behind."""
 
 from __future__ import annotations
 
 import contextlib
 import itertools
-import multiprocessing
 import os
-import pickle
 import select
 import signal
 import threading
-from collections.abc import Callable, Iterator
-from types import SimpleNamespace
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -22,27 +19,14 @@ from census import wait_until
 from fiber._hub import one_way, queue_delivery
 from fiber._hub.hosted import HostedReceiver
 from fiber._hub.local import LocalChannel
-from fiber._hub.one_way import AMBIGUOUS, ReceivingEnd, SendingEnd
+from fiber._hub.one_way import AMBIGUOUS, ReceivingEnd
 from fiber._hub.queue_delivery import Dealer
 from fiber._transport import channels
 from fiber._wire import packet
 from fiber.errors import ConnectionClosed
 from hosts import Far, background
 from patience import PATIENCE
-
-SIZES = (0, 1, 40, 100, 1000, 10_000, 60_000)
-MORE_THAN_A_SOCKET = 1000
-"""Small messages that no socket holds."""
-
-Ends = tuple[ReceivingEnd, SendingEnd]
-
-
-@pytest.fixture
-def ends() -> Iterator[Ends]:
-    receiver, sender = one_way.pair()
-    yield receiver, sender
-    receiver.close()
-    sender.close()
+from processes.one_way_ends import MORE_THAN_A_SOCKET, Ends, drain, filled, numbers, overflow
 
 
 def is_readable(channel: ReceivingEnd) -> bool:
@@ -102,220 +86,6 @@ def test_a_poll_sleeps_as_long_as_it_may(ends: Ends, monkeypatch: pytest.MonkeyP
         naps.clear()
         assert not receiver.poll(timeout)
         assert naps == [0]
-
-
-def overflow(sender: SendingEnd, count: int = MORE_THAN_A_SOCKET) -> None:
-    for number in range(count):
-        assert sender.try_send(b"%d" % number)
-    assert sender.backlog
-
-
-def drain(receiver: ReceivingEnd) -> list[bytes]:
-    taken = []
-    while (message := receiver.try_recv()) is not None:
-        taken.append(message.tobytes())
-    return taken
-
-
-def numbers(count: int) -> list[bytes]:
-    return [b"%d" % number for number in range(count)]
-
-
-# How much there is room for
-
-
-def filled(send: Callable[[], bool]) -> int:
-    count = 0
-    while send():
-        count += 1
-    return count
-
-
-def held_by_multiprocessing(size: int, *, duplex: bool) -> int:
-    reader, writer = multiprocessing.Pipe(duplex)
-    os.set_blocking(writer.fileno(), False)
-
-    def send() -> bool:
-        try:
-            writer.send("x" * size)
-        except BlockingIOError:
-            return False
-        return True
-
-    with reader, writer:
-        return filled(send)
-
-
-def held_by_fiber(size: int, *, duplex: bool) -> int:
-    if duplex:
-        one, other = fiber.Pipe()
-        channel = pickle.loads(pickle.dumps(one._channel))
-    else:
-        other, one = fiber.Pipe(duplex=False)
-        channel = one._channel
-    message = pickle.dumps("x" * size)
-    with one, other:
-        count = filled(lambda: channel.try_send(message))
-        channel.close()
-    return count
-
-
-@pytest.mark.parametrize("duplex", [False, True])
-@pytest.mark.parametrize("size", SIZES)
-def test_a_pipe_holds_as_much_as_multiprocessings(size: int, duplex: bool) -> None:
-    assert held_by_fiber(size, duplex=duplex) >= held_by_multiprocessing(size, duplex=duplex)
-
-
-@pytest.mark.parametrize("size", [1, 40, 1000])
-def test_a_simple_queue_of_another_host_holds_as_much_as_multiprocessings(
-    size: int, far: Far
-) -> None:
-    count = held_by_multiprocessing(size, duplex=False)
-    here: Any = fiber.SimpleQueue()
-    there = far(here)
-    item = "x" * size
-    sender = background(lambda: [there.put(item) for _ in range(count)])
-    sender.join(60)
-    assert not sender.is_alive()
-    assert [there.get() for _ in range(count)] == [item] * count
-
-
-def here(queue: Any) -> Any:
-    """Return another holder of a queue in this process."""
-    return pickle.loads(pickle.dumps(queue))
-
-
-@pytest.mark.parametrize("make", [fiber.Queue, fiber.JoinableQueue, lambda: fiber.Queue(30_000)])
-@pytest.mark.parametrize("elsewhere", [False, True], ids=["here", "there"])
-@pytest.mark.parametrize("size", [1, 40, 1000])
-def test_a_process_that_put_as_much_as_multiprocessings_queue_holds_can_end(
-    size: int, elsewhere: bool, make: Callable[[], Any], far: Far
-) -> None:
-    count = held_by_multiprocessing(size, duplex=False)
-    queue = make()
-    holder: Any = far(queue) if elsewhere else here(queue)
-    for _ in range(count):
-        holder.put("x" * size)
-    holder.close()
-    ended = background(holder.join_thread)
-    ended.join(PATIENCE)
-    assert not ended.is_alive()
-    assert [queue.get() for _ in range(count)] == ["x" * size] * count
-
-
-def test_a_bounded_queue_gives_back_the_place_of_each_item_of_its_backlog() -> None:
-    queue: Any = fiber.Queue(MORE_THAN_A_SOCKET)
-    putter = here(queue)
-    for number in range(MORE_THAN_A_SOCKET):
-        putter.put(number)
-    putter.close()
-    putter.join_thread()
-    assert queue.full()
-    assert [queue.get() for _ in range(MORE_THAN_A_SOCKET)] == [*range(MORE_THAN_A_SOCKET)]
-    assert queue._slots._free.value() == MORE_THAN_A_SOCKET
-    assert queue.empty()
-
-
-# ``post``, by which a queue sends
-
-
-class Clock:
-    """Time for a sender.  It goes on by what the sender sleeps, and ``naps`` has those times."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.now = 1000.0
-        self.naps: list[float] = []
-        self.at_a_nap: Callable[[], object] = lambda: None
-        time = SimpleNamespace(monotonic=lambda: self.now, sleep=self.nap)
-        monkeypatch.setattr(one_way, "time", time)
-        monkeypatch.setattr(one_way, "wait_until", lambda _fd, _events, seconds: self.nap(seconds))
-
-    def nap(self, seconds: float) -> None:
-        self.naps.append(seconds)
-        self.now += seconds
-        self.at_a_nap()
-
-
-@pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    return Clock(monkeypatch)
-
-
-def in_the_backlog(ends: Ends) -> int:
-    """Return the number of bytes that the backlog has ever had."""
-    return int(ends[0].backlog.words[one_way.TAIL])
-
-
-def test_a_message_goes_through_the_socket_if_receivers_soon_make_room(
-    ends: Ends, clock: Clock
-) -> None:
-    receiver, sender = ends
-    held = filled(lambda: sender.try_send_directly(b"first"))
-    clock.at_a_nap = receiver.recv
-    sender.post(b"last")
-    assert clock.naps == pytest.approx([one_way.PATIENCE])
-    assert drain(receiver) == [b"first"] * (held - 1) + [b"last"]
-    assert not in_the_backlog(ends)
-
-
-def test_a_message_goes_through_the_socket_if_receivers_soon_empty_the_backlog(
-    ends: Ends, clock: Clock
-) -> None:
-    receiver, sender = ends
-    overflow(sender)
-    before, taken = in_the_backlog(ends), []
-    clock.at_a_nap = lambda: taken.extend(drain(receiver))
-    sender.post(b"last")
-    assert len(clock.naps) == 1
-    assert taken == numbers(MORE_THAN_A_SOCKET)
-    assert drain(receiver) == [b"last"]
-    assert in_the_backlog(ends) == before
-
-
-def test_a_slow_receiver_makes_a_sender_wait_once_in_a_while(ends: Ends, clock: Clock) -> None:
-    receiver, sender = ends
-    overflow(sender)
-    clock.at_a_nap = receiver.recv
-    sender.post(b"waits")
-    assert sum(clock.naps) == pytest.approx(one_way.PATIENCE)
-    clock.naps.clear()
-    for _ in range(100):
-        sender.post(b"does not wait")
-    assert not clock.naps
-    clock.now += one_way.HURRY
-    sender.post(b"waits again")
-    assert sum(clock.naps) == pytest.approx(one_way.PATIENCE)
-    assert drain(receiver)[-102:] == [b"waits", *[b"does not wait"] * 100, b"waits again"]
-
-
-def test_a_sender_of_another_host_does_not_wait_for_an_empty_backlog(far: Far) -> None:
-    queue: Any = fiber.SimpleQueue()
-    there = far(queue)
-    for _ in range(MORE_THAN_A_SOCKET):
-        queue.put("here")
-    busy, done = threading.Event(), threading.Event()
-
-    def keep_full() -> None:
-        while not done.is_set():
-            queue.put(queue.get())
-            busy.set()
-
-    keeper = background(keep_full)
-    assert busy.wait(PATIENCE)
-    sender = background(there.put, "there")
-    sender.join(PATIENCE)
-    done.set()
-    keeper.join(PATIENCE)
-    assert not sender.is_alive()
-
-
-def test_small_and_large_messages_share_the_room(ends: Ends) -> None:
-    receiver, sender = ends
-    overflow(sender)
-    assert sender.try_send(bytes(20_000))
-    assert sender.try_send(b"last")
-    taken = drain(receiver)
-    assert taken == [*numbers(MORE_THAN_A_SOCKET), bytes(20_000), b"last"]
 
 
 # Received messages
