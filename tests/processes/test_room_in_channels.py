@@ -1,4 +1,4 @@
-"""How much a pipe or queue holds unread, and how patient the sender of a queue is."""
+"""Room of pipes and queues for unread messages, and the patience of the sender of a queue."""
 
 from __future__ import annotations
 
