@@ -15,8 +15,9 @@ def double(number: int) -> int:
     return 2 * number
 
 
-def linger(_: int) -> None:
-    """Work until the worker is killed."""
+def linger(_: int, begun: fiber.SimpleQueue[None]) -> None:
+    """Say that this task has begun, and work until the worker is killed."""
+    begun.put(None)
     signal.pause()
 
 
@@ -29,7 +30,10 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)
     with fiber.Pool(2) as pool:
         total = sum(pool.map(double, range(100)))
-        results = [pool.apply_async(linger, (number,)) for number in range(2)]
+        begun: fiber.SimpleQueue[None] = fiber.SimpleQueue()
+        results = [pool.apply_async(linger, (number, begun)) for number in range(2)]
+        for _ in results:
+            begun.get()
         print(json.dumps({"event": "waiting", "total": total}), flush=True)
         with contextlib.suppress(KeyboardInterrupt):
             for result in results:
