@@ -209,8 +209,7 @@ class HostedSender(HostedChannel):
             if patience:
                 self._try_again_after(patience)
                 return False
-            sent = self._channel.try_send(payload, buffers)
-            self._events = self._channel.room_events
+            sent = super()._try_send(payload, buffers)
         if sent:
             self._begin = None
         return sent

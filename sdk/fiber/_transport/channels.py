@@ -426,11 +426,11 @@ class UnixCounter:
         self._owner.close()
 
 
-def wait_until(fd: int, events: int, timeout: float | None = None) -> bool:
-    """Wait for one of ``events`` of ``fd``, or for its end; return False after ``timeout`` s."""
+def wait_until(fd: int, events: int, timeout: float | None = None) -> None:
+    """Wait for one of ``events`` of ``fd``, or for its end, for at most ``timeout`` seconds."""
     poller = select.poll()
     poller.register(fd, events)
-    return bool(poller.poll(None if timeout is None else timeout * 1000))
+    poller.poll(None if timeout is None else timeout * 1000)
 
 
 def wait_readable(fd: int, timeout: float | None) -> bool:
