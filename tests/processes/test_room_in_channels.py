@@ -5,7 +5,6 @@ from __future__ import annotations
 import multiprocessing
 import os
 import pickle
-import threading
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -177,27 +176,6 @@ def test_a_slow_receiver_makes_a_sender_wait_once_in_a_while(ends: Ends, clock: 
     sender.post(b"waits again")
     assert sum(clock.naps) == pytest.approx(one_way.PATIENCE)
     assert drain(receiver)[-102:] == [b"waits", *[b"does not wait"] * 100, b"waits again"]
-
-
-def test_a_sender_of_another_host_does_not_wait_for_an_empty_backlog(far: Far) -> None:
-    queue: Any = fiber.SimpleQueue()
-    there = far(queue)
-    for _ in range(MORE_THAN_A_SOCKET):
-        queue.put("here")
-    busy, done = threading.Event(), threading.Event()
-
-    def keep_full() -> None:
-        while not done.is_set():
-            queue.put(queue.get())
-            busy.set()
-
-    keeper = background(keep_full)
-    assert busy.wait(PATIENCE)
-    sender = background(there.put, "there")
-    sender.join(PATIENCE)
-    done.set()
-    keeper.join(PATIENCE)
-    assert not sender.is_alive()
 
 
 def test_small_and_large_messages_share_the_room(ends: Ends) -> None:
