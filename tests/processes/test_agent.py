@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import pickle
+import queue
 import resource
+import select
 import signal
 import sys
 import threading
@@ -146,6 +148,25 @@ def test_work_goes_out_and_answers_come_back(shared: Agent) -> None:
     child.deliver(2, pickle.dumps(8), [memoryview(large)])
     assert observer.wait_for_words(2) == [(1, 7), (2, 8 + len(large))]
     end(child, observer)
+
+
+def test_a_packet_waits_for_the_report_of_the_start(
+    own: Agent, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    replies: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+    reply = Agent._on_reply
+    monkeypatch.setattr(
+        Agent, "_on_reply", lambda *arguments: replies.put(partial(reply, *arguments))
+    )
+    child, observer = begin(own, read_never, tasks=True)
+    report_start = replies.get(timeout=PATIENCE)
+    assert child._ours is not None
+    assert select.select([child._ours], [], [], PATIENCE)[0]
+    settled(own.loop)
+    assert observer.events == []
+    own.loop.call_soon(report_start)
+    observer.wait_for_words(1)
+    assert observer.events == ["started", "received"]
 
 
 def test_unread_packets_of_a_dead_worker_are_named(shared: Agent) -> None:

@@ -169,9 +169,7 @@ class Agent:
         if child is None:
             self._on_reply_about_abandoned(link, reply)
         elif reply[0] == zygote.STARTED:
-            child.pid = reply[2]
-            child.release_descriptors()
-            child.observer.started(reply[2])
+            child.started(reply[2])
         elif reply[0] == zygote.EXITED:
             reason, stack = self.describe_end(reply[2]), "".join(reply[3:])
             self._child_exited(child, reply[2], reason, stack=stack)
@@ -329,12 +327,24 @@ class LocalChild:
         self._ours, self._theirs = ours, theirs
 
     def open(self) -> None:
-        """Make the task channel of a pool worker and begin to receive from it."""
+        """Make the task channel of a pool worker."""
         if self._spec.tasks:
             self._make_channel()
         if self._ours is not None:
             self._outbox = Outbox(self._loop, self._ours)
             self._loop.register(self._ours.fileno(), self._receive)
+            self.pause()
+
+    def started(self, pid: int) -> None:
+        """Report that the child runs, and begin to receive its packets.
+
+        The first answer of a worker may arrive before its zygote reports the start.  It waits, so
+        that the worker's process identifier is known to a caller that has an answer.
+        """
+        self.pid = pid
+        self.release_descriptors()
+        self.observer.started(pid)
+        self.resume()
 
     def fork_from(self, zygote: ZygoteLink, hub: HubAddress | None) -> None:
         """Have ``zygote`` start the child; ``hub`` is the address of the host's hub."""
