@@ -62,7 +62,7 @@ def _found(module: str) -> bool:
         return False
 
 
-# Colours: Okabe and Ito's set, which colour-blind readers can tell apart, and Tol's wine.
+# Colours: Okabe and Ito's set, which colour-blind readers can tell apart, and some of Tol's.
 ALL = (
     Contender(
         "fiber",
@@ -200,7 +200,7 @@ ALL = (
         "SubprocVecEnv",
         ("stable_baselines3",),
         VECTOR | PPO,
-        "#E69F00",
+        "#999933",
         "H",
         by_name=("torch",),
     ),
@@ -259,8 +259,8 @@ ON_HOSTS = Contender(
     "Fiber, 8 workers a host",
     ("fiber",),
     EVOLUTION,
-    "#56B4E9",
-    "s",
+    "#332288",
+    "d",
     environment={"FIBER_BACKEND": "local"},
 )
 ADOPTED = Contender(

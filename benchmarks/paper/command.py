@@ -20,6 +20,7 @@ from benchmarks.paper import packages, page, pictures
 from benchmarks.paper.packages import Missing
 from benchmarks.paper.parts import PARTS, Part, contenders_of, has_cluster
 from benchmarks.paper.recording import BadRecording
+from benchmarks.paper.walker import minutes_of
 from benchmarks.rounds import Rounds, say, scratch_folder
 from benchmarks.session import ROOT
 
@@ -43,16 +44,18 @@ def main(arguments: Sequence[str]) -> int:
     processes.adopt_orphans()
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        new = {part.name: _measure(part, options, command) for part in parts}
-        if _WALKER in options.only:
-            _walk(options)
+        for part in parts:
+            runs[part.name] = _measure(part, options, command)
+            _write(options.output, runs)
+        walked = _WALKER not in options.only or _walk(options)
     except KeyboardInterrupt:
-        say("interrupted: no page is written")
+        say("interrupted: the part that was being measured is not written")
         return 130
-    runs.update(new)
-    _write(options.output, runs)
-    failed = {name for run in new.values() for those in run.failures.values() for name in those}
-    return int(any(name.startswith("fiber") for name in failed))
+    if _WALKER in options.only:
+        _write(options.output, runs)
+    new = [runs[part.name] for part in parts]
+    failed = {name for run in new for those in run.failures.values() for name in those}
+    return int(not walked or any(name.startswith("fiber") for name in failed))
 
 
 def _problems(parts: Sequence[Part], options: argparse.Namespace) -> list[str]:
@@ -71,6 +74,22 @@ def _problems(parts: Sequence[Part], options: argparse.Namespace) -> list[str]:
             f'{_PODS} needs a cluster: set KUBECONFIG and FIBER_IMAGE, or run eval "$(make -s '
             'cluster)" first'
         )
+    return [*found, *_nothing_to_measure(parts, options)]
+
+
+def _nothing_to_measure(parts: Sequence[Part], options: argparse.Namespace) -> list[str]:
+    """Return a line for each part of which the options choose nothing."""
+    found = []
+    for part in parts:
+        if not contenders_of(part, options.contenders):
+            wanted = ", ".join(options.contenders)
+            there = ", ".join(each.name for each in part.contenders)
+            found.append(f"part {part.name} has no contender {wanted}; it has {there}")
+        cases = part.cases(options.size)
+        if not _chosen(cases, options.workers):
+            wanted = ", ".join(map(str, options.workers))
+            there = ", ".join(dict.fromkeys(str(case.params["workers"]) for case in cases))
+            found.append(f"part {part.name} has no case with {wanted} workers; it has {there}")
     return found
 
 
@@ -98,15 +117,21 @@ def _chosen(cases: Sequence[Case], workers: list[int] | None) -> list[Case]:
 def _able(contenders: Sequence[Contender]) -> tuple[list[Contender], dict[str, str]]:
     skipped = {each.name: missing for each in contenders if (missing := each.missing())}
     for name, missing in skipped.items():
-        say(f"{name} is skipped, not installed: {missing} (make paper installs it)")
+        say(f"{name} is skipped, because {missing} is not installed")
     return [each for each in contenders if each.name not in skipped], skipped
 
 
-def _walk(options: argparse.Namespace) -> None:
-    """Train the walker in its own process, since Fiber must not share one with the contenders."""
+def _walk(options: argparse.Namespace) -> bool:
+    """Train the walker in its own process, since Fiber must not share one with the contenders.
+
+    Return False if it failed.
+    """
     minutes = 0.0 if options.quick else options.minutes
     command = [sys.executable, "-m", "benchmarks.paper.walker", "--minutes", str(minutes)]
-    subprocess.run([*command, "--output", str(options.output)], cwd=ROOT, check=True)
+    status = subprocess.call([*command, "--output", str(options.output)], cwd=ROOT)
+    if status:
+        say(f"the walker failed with status {status}: its output is above")
+    return status == 0
 
 
 def _write(folder: Path, runs: dict[str, Run]) -> None:
@@ -133,7 +158,7 @@ def _parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--rounds", type=count_of, help=f"default {_ROUNDS}; 1 with --quick")
     parser.add_argument("--size", type=share_of, help="share of the full amount of work, default 1")
     parser.add_argument(
-        "--minutes", type=float, default=_MINUTES, help="training of the walker, default 15"
+        "--minutes", type=minutes_of, default=_MINUTES, help="training of the walker, default 15"
     )
     parser.add_argument(
         "--quick", action="store_true", help="one tiny round, written to build/paper, as a trial"

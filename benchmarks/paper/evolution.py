@@ -174,6 +174,7 @@ def _make_table(path: Path) -> None:
     """Write the table beside its place, and put it there in one step: others may do the same."""
     import numpy as np
 
+    path.parent.mkdir(parents=True, exist_ok=True)  # another host lacks the program's folder
     partial_path = path.with_suffix(f".{os.getpid()}")
     noise = np.random.default_rng(7).standard_normal(NOISE, dtype=np.float32)
     partial_path.write_bytes(noise.tobytes())

@@ -11,13 +11,22 @@ from benchmarks.contenders import BY_NAME
 from benchmarks.model import Case, Metric, Run
 from benchmarks.paper import breakout, evolution, populations_results, walker
 from benchmarks.paper.parts import PARTS
+from benchmarks.rounds import LONG
 from benchmarks.samples import Summary, in_words, ratio, summary, times
 from benchmarks.session import ROOT
 
 FOLDER = ROOT / "docs" / "paper"
 PAGE = ROOT / "docs" / "paper.md"
 RESULTS = "results.json"
+ONCE = "¹"
+"""Mark of a value that was measured once, while others were measured in each round."""
 _MARKED = re.compile(r"(<!-- (\w+): begin[^>]*-->\n)(.*?)(<!-- \2: end -->)", re.DOTALL)
+
+
+_RATIO = (
+    "A ratio is the median of the ratios of the rounds. It can differ from the ratio of the "
+    "medians."
+)
 
 
 def load(folder: Path) -> dict[str, Run]:
@@ -64,7 +73,7 @@ def _overhead(run: Run) -> str:
     for name in names:
         cells = [_cell(run, case, name, overhead.TIME) for case in cases]
         rows.append([BY_NAME[name].label, *cells, _times(run, cases[-1], name, "fiber")])
-    return _text(run, report.table(head, rows))
+    return _text(run, report.table(head, rows), _RATIO)
 
 
 def _short(case: Case) -> str:
@@ -113,7 +122,7 @@ def _breakout(run: Run) -> str:
         rows.append([case.name, *cells])
     note = (
         "Time of all steps with learning. In parentheses: the ratio to SubprocVecEnv with "
-        "multiprocessing in the same round."
+        f"multiprocessing. {_RATIO}"
     )
     return _text(run, report.table(head, rows), note)
 
@@ -134,7 +143,10 @@ def _cell(run: Run, case: Case, name: str, metric: Metric) -> str:
     if name in run.failures.get(case.name, {}):
         return "✗"
     found = _found(run, case, name, metric)
-    return in_words(found.median, metric.unit) if found else "not run"
+    if not found:
+        return "not run"
+    once = ONCE if found.rounds == 1 < run.about["rounds"] else ""
+    return in_words(found.median, metric.unit) + once
 
 
 def _found(run: Run, case: Case, name: str, metric: Metric) -> Summary | None:
@@ -154,6 +166,9 @@ def _text(run: Run, table: str, note: str = "") -> str:
         "One round."
         if run.about["rounds"] == 1
         else f"Median of at most {run.about['rounds']} rounds.",
+        f"{ONCE} Measured once, because it took over {LONG:g} s with its start."
+        if ONCE in table
+        else "",
         note,
         f"Before the rounds, other programs used {shares} of the processors' time."
         if shares

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import shlex
 import sys
@@ -228,10 +229,17 @@ def _in_words(test: Test) -> str:
     )
 
 
+def minutes_of(text: str) -> float:
+    """Return the minutes of an option, which are finite.  With 0 the policy is only tested."""
+    if not (math.isfinite(minutes := float(text)) and minutes >= 0):
+        raise argparse.ArgumentTypeError(f"{text} is not a number of minutes, 0 or more")
+    return minutes
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Train, and write the results and the picture; 1 if Box2D is missing."""
     parser = argparse.ArgumentParser("benchmarks.paper.walker")
-    parser.add_argument("--minutes", type=float, default=15.0)
+    parser.add_argument("--minutes", type=minutes_of, default=15.0)
     parser.add_argument("--workers", type=int, default=os.cpu_count())
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--output", type=Path, default=Path("docs/paper"), metavar="FOLDER")

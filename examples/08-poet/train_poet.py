@@ -27,11 +27,11 @@ class Poet:
         self.pool, self.pairs, self.most = pool, pairs, most
         self.rng = np.random.default_rng(seed)
         self.archive, self.scores = list[Course](), dict[int, float]()
-        self.add(Course(1.0, 0.3, 0.05, seed), self.rng.normal(size=PARAMETERS) * 0.1)
+        self.add(Course(1.0, 0.3, 0.05, seed), self.rng.normal(size=PARAMETERS) * 0.1, 0.0)
 
-    def add(self, course: Course, policy: Array) -> None:
+    def add(self, course: Course, policy: Array, score: float) -> None:
         """Add a pair; where they are too many, the oldest one goes."""
-        self.pairs[len(self.archive)], self.scores[len(self.archive)] = (course, policy), 0.0
+        self.pairs[len(self.archive)], self.scores[len(self.archive)] = (course, policy), score
         self.archive.append(course)
         if len(self.scores) > self.most:
             del self.pairs[min(self.scores)], self.scores[min(self.scores)]
@@ -63,12 +63,12 @@ class Poet:
         chosen = self.rng.choice(parents, CHILDREN).tolist() if parents else []
         born = [(self.archive[each].child(self.rng), self.pairs[each][1]) for each in chosen]
         scores = self.pool.starmap(play, [(course, policy[None]) for course, policy in born])
-        fit = [born[at] for at, (score,) in enumerate(scores) if TOO_HARD < score < TOO_EASY]
-        for course, policy in sorted(fit, key=self.novelty, reverse=True)[:ADMITTED]:
-            self.add(course, policy)
+        fit = [(*born[at], each) for at, (each,) in enumerate(scores) if TOO_HARD < each < TOO_EASY]
+        for child in sorted(fit, key=self.novelty, reverse=True)[:ADMITTED]:
+            self.add(*child)
 
-    def novelty(self, pair: tuple[Course, Array]) -> float:
-        apart = (np.array([earlier[:3] for earlier in self.archive]) - pair[0][:3]) / HARDEST
+    def novelty(self, child: tuple[Course, Array, float]) -> float:
+        apart = (np.array([earlier[:3] for earlier in self.archive]) - child[0][:3]) / HARDEST
         return float(np.sort(np.linalg.norm(apart, axis=1))[:NEIGHBOURS].mean())
 
 
@@ -79,11 +79,10 @@ def draw(path: Path, history: list[tuple[dict[int, float], int]]) -> None:
         scores[list(pairs), iteration] = list(pairs.values())
     figure = Figure(figsize=(8.6, 5.4), dpi=150, layout="constrained")
     lives, sizes = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
-    image = lives.imshow(scores, aspect="auto", origin="lower", interpolation="none")
-    figure.colorbar(image, ax=lives, label="crossed, percent of the course")
+    figure.colorbar(lives.pcolormesh(scores), ax=lives, label="crossed, percent of the course")
     lives.set(title="Score of each pair", ylabel="pair, oldest below")
-    sizes.plot([(len(pairs), workers) for pairs, workers in history], drawstyle="steps-mid")
-    sizes.set(xlabel="iterations before", ylabel="number")
+    sizes.step(range(1, len(history) + 1), [(len(pairs), count) for pairs, count in history])
+    sizes.set(xlabel="iteration", ylabel="number")
     sizes.legend(["pairs", "workers"], frameon=False)
     figure.savefig(path)
 

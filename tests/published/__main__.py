@@ -9,6 +9,7 @@ table of docs/published.md.  The exit status is 0 if all programs ran and gave t
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import signal
@@ -56,6 +57,7 @@ def compare(program: Program, clones: Path, backends: Sequence[str]) -> bool:
         print(line, file=sys.stderr)
         return False
     clone = clones / program.clone
+    _note_other_commit(program, clone)
     outcome: dict[str, str] = {}
     changed: list[str] = []
     expected = _run(program, clone, program.reference).result
@@ -68,6 +70,18 @@ def compare(program: Program, clones: Path, backends: Sequence[str]) -> bool:
     if expected:
         _write(program.name, checks.commit(clone), changed, outcome)
     return bool(expected) and all(each.startswith("same") for each in outcome.values())
+
+
+def _note_other_commit(program: Program, clone: Path) -> None:
+    """Say which commit ran before if it is not that of the clone."""
+    before = table.read(RESULTS).get(program.name, {}).get("commit")
+    now = checks.commit(clone)
+    if before and now != before:
+        print(
+            f"{program.name}: {clone} is at commit {now}, and the table has {before}. If it fails, "
+            f"check out that one: git -C {clone} checkout {before}",
+            file=sys.stderr,
+        )
 
 
 def _write(name: str, commit: str, changed: list[str], outcome: dict[str, str]) -> None:
@@ -89,13 +103,15 @@ def verdict(expected: dict[str, Any] | None, ended: Ended) -> str:
     if found:
         return f"differs: {found}"
     values = list(leaves(expected["values"]).values())
+    if not values:
+        return "failed: it gave no values to compare"
     failures = sum(value in ("failure", "error") for value in values)
     return f"same ({len(values)} values{f', {failures} of them failures' if failures else ''})"
 
 
 def _run(program: Program, clone: Path, backend: str) -> Ended:
     """Run the program once, in a process of its own session."""
-    with tempfile.TemporaryDirectory(prefix="published-") as parent:
+    with tempfile.TemporaryDirectory(prefix="published-", ignore_cleanup_errors=True) as parent:
         folder = Path(parent, "run")
         folder.mkdir()
         names = [program.name, backend, str(clone), str(folder)]
@@ -135,24 +151,41 @@ def _environment() -> dict[str, str]:
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """Kill the processes that a run has left in its session."""
-    try:
-        os.killpg(process.pid, signal.SIGKILL)
-    except ProcessLookupError:
-        pass  # none is left
+    """Kill the processes that a run has left in its session, also those of other groups."""
+    while left := _living(process.pid):
+        for pid in left:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        process.poll()
     process.wait()
+
+
+def _living(session: int) -> list[int]:
+    """Return the processes of a session, without those that have ended."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):  # it has ended
+            state, _parent, _group, its_session = path.read_text().rpartition(")")[2].split()[:4]
+            if int(its_session) == session and state not in "ZX":
+                found.append(int(path.parent.name))
+    return found
 
 
 def _parse(every: dict[str, Program], arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="published")
-    parser.add_argument("clones", type=Path, help="folder with a clone of each project")
+    parser.add_argument("clones", help="folder with a clone of each project")
     parser.add_argument("--only", nargs="+", metavar="NAME", default=list(every))
     parser.add_argument("--backends", nargs="+", choices=table.BACKENDS, default=available())
     options = parser.parse_args(arguments)
+    if not options.clones:
+        parser.error("name the folder with the clones: make published CLONES=folder")
+    options.clones = Path(options.clones)
     if not options.clones.is_dir():
         parser.error(f"{options.clones} is no folder: name the folder with the clones")
     if unknown := [name for name in options.only if name not in every]:
         parser.error(f"there is no program {unknown[0]}: choose from {', '.join(every)}")
+    if unable := [name for name in options.backends if name not in available()]:
+        parser.error(f"{unable[0]} needs a cluster and an image: set KUBECONFIG and FIBER_IMAGE")
     options.clones = options.clones.resolve()
     return options
 

@@ -63,7 +63,7 @@ def unfit_version(program: Program, clone: Path) -> str | None:
 def missing_package(package: Package) -> str | None:
     """Return how to install this package, or None if a version that fits is installed."""
     wanted = Requirement(package.requirement)
-    if importlib.util.find_spec(package.module) is None:
+    if not _is_found(package.module):
         return f"{package.module} is not installed: pip install {str(wanted)!r}, or {EVERYTHING}"
     try:
         version = importlib.metadata.version(wanted.name)
@@ -76,6 +76,13 @@ def missing_package(package: Package) -> str | None:
     return None
 
 
+def _is_found(module: str) -> bool:
+    try:
+        return importlib.util.find_spec(module) is not None
+    except ModuleNotFoundError:  # the package that would contain it is missing
+        return False
+
+
 def missing_rom(game: str) -> str | None:
     """Return how to get the ROM of this game, or None if ale-py has it."""
     spec = importlib.util.find_spec("ale_py")
@@ -86,7 +93,10 @@ def missing_rom(game: str) -> str | None:
 
 
 def commit(clone: Path) -> str:
-    """Return the first characters of the clone's commit, or "unknown" without git's folder."""
+    """Return the first characters of the clone's commit; "unknown" without git or its folder."""
     command = ["git", "-c", "safe.directory=*", "-C", str(clone), "rev-parse", "HEAD"]
-    found = subprocess.run(command, capture_output=True, text=True)
+    try:
+        found = subprocess.run(command, capture_output=True, text=True)
+    except FileNotFoundError:
+        return "unknown"
     return found.stdout[:10] if found.returncode == 0 else "unknown"

@@ -17,6 +17,7 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
 from benchmarks import fake_agents, tasks  # noqa: E402
+from benchmarks.model import Run  # noqa: E402
 from benchmarks.paper import (  # noqa: E402
     atari,
     breakout,
@@ -242,6 +243,8 @@ def test_the_walker_moves_to_the_better_half() -> None:
         (["--contenders", "slurm"], "no contender 'slurm'; there are fiber,"),
         (["--rounds", "0"], "0 is less than 1"),
         (["--size", "2"], "2 is not above 0 and up to 1"),
+        (["--minutes", "nan"], "nan is not a number of minutes, 0 or more"),
+        (["--minutes", "-1"], "-1 is not a number of minutes, 0 or more"),
     ],
 )
 def test_a_wrong_argument_is_refused(
@@ -281,6 +284,38 @@ def test_a_missing_cluster_is_one_line(
     assert command.main(["--only", "overhead", "--contenders", "fiber-kubernetes"]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert "needs a cluster: set KUBECONFIG and FIBER_IMAGE" in line
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["breakout", "--contenders", "dask"], "part breakout has no contender dask; it has fiber"),
+        (["evolution", "--workers", "33"], "part evolution has no case with 33 workers; it has 32"),
+    ],
+)
+def test_a_part_without_anything_to_measure_is_one_line(
+    arguments: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command.main(["--only", *arguments, "--output", str(tmp_path)]) == 1
+    lines = capsys.readouterr().err.splitlines()
+    assert [line for line in lines if line.startswith(said)] == [lines[-1]]
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_walker_that_fails_leaves_what_was_measured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    written: list[list[str]] = []
+    monkeypatch.setattr(command, "_problems", lambda *_: [])
+    monkeypatch.setattr(command, "_measure", lambda *_: Run({}))
+    monkeypatch.setattr(command, "_write", lambda _folder, runs: written.append(list(runs)))
+    monkeypatch.setattr(command.processes, "adopt_orphans", lambda: None)
+    monkeypatch.setattr("signal.signal", lambda *_: None)
+    monkeypatch.setattr("subprocess.call", lambda *_, **__: 3)
+    arguments = ["--only", "overhead", "walker", "--output", str(tmp_path)]
+    assert command.main(arguments) == 1
+    assert written == [["overhead"], ["overhead"]]
+    assert "the walker failed with status 3" in capsys.readouterr().err
 
 
 def test_contenders_leave_out_more_processes_than_fit(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -72,11 +73,15 @@ def test_a_missing_clone_is_one_line_that_says_how_to_get_it(tmp_path: Path) -> 
             record(packages=(Package("no_such_box", "no-such>=2"),)),
             "pip install 'no-such>=2'",
         ),
+        (
+            record(packages=(Package("no_such_box.lid", "no-such>=2"),)),
+            "pip install 'no-such>=2'",
+        ),
         (record(packages=(Package("pytest", "pytest>=9999"),)), "pip install 'pytest>=9999'"),
         (record(packages=(Package("pytest", "no-such-box"),)), "pip install 'no-such-box'"),
         (record(roms=("no_such_game",)), "ROM of no_such_game is not installed: pip install"),
     ],
-    ids=["file", "version", "no version", "package", "old package", "other package", "rom"],
+    ids=["file", "version", "no version", "package", "module", "old", "other", "rom"],
 )
 def test_other_bad_input_is_one_line_that_says_what_to_do(
     program: Program, said: str, clones: Path
@@ -109,15 +114,38 @@ def test_a_missing_program_does_not_stop_the_others(
 
 
 @pytest.mark.parametrize(
-    "arguments", [["no-such-folder"], [".", "--only", "nobody"], [".", "--backends", "moon"]]
+    ("arguments", "said"),
+    [
+        ([""], "name the folder with the clones: make published CLONES=folder"),
+        (["no-such-folder"], "no-such-folder is no folder"),
+        ([".", "--only", "nobody"], "there is no program nobody"),
+        ([".", "--backends", "moon"], "invalid choice: 'moon'"),
+        ([".", "--backends", "kubernetes"], "kubernetes needs a cluster and an image"),
+    ],
 )
 def test_wrong_arguments_are_refused(
-    arguments: list[str], capsys: pytest.CaptureFixture[str]
+    arguments: list[str],
+    said: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
+    monkeypatch.delenv("FIBER_IMAGE", raising=False)
     with pytest.raises(SystemExit) as ended:
         published.main(arguments)
     assert ended.value.code == 2
-    assert arguments[-1] in capsys.readouterr().err
+    assert said in capsys.readouterr().err
+
+
+def test_another_commit_than_that_of_the_table_is_named(
+    clones: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    results = clones / "results.json"
+    table.write(results, {"walker": {"commit": "0123456789"}})
+    monkeypatch.setattr(published, "RESULTS", results)
+    monkeypatch.setattr(published, "_run", lambda *_: Ended(None, "status 1"))
+    assert not published.compare(record(), clones, ["local"])
+    said = capsys.readouterr().err
+    assert f"git -C {clones / 'walker'} checkout 0123456789" in said
 
 
 def test_pods_need_a_cluster_and_an_image(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -152,8 +180,30 @@ def test_a_verdict_says_what_happened() -> None:
     failed = {"values": {"test": "failure", "other": "passed"}}
     assert verdict(failed, Ended(failed)) == "same (2 values, 1 of them failures)"
     assert verdict(expected, Ended({"values": {"a": [1, 3]}})).startswith("differs: a[1] is 3")
+    nothing = Ended({"values": {"a": []}})
+    assert verdict({"values": {}}, nothing) == "failed: it gave no values to compare"
     assert verdict(expected, Ended(None, "status 1")) == "failed: status 1"
     assert verdict(None, Ended(None)) == "not run: it failed with multiprocessing"
+
+
+def test_a_run_leaves_no_process_of_any_group() -> None:
+    program = (
+        "import subprocess, sys\n"
+        "print(subprocess.Popen(['sleep', '600'], process_group=0).pid, flush=True)\n"
+        "sys.stdin.read()\n"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", program],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        start_new_session=True,
+    )
+    with process:
+        assert process.stdout is not None
+        pid = int(process.stdout.readline())
+        assert pid in published._living(process.pid)
+        published._end(process)
+        assert published._living(process.pid) == []
 
 
 def test_changed_lines_are_counted_in_a_copy(clones: Path, tmp_path: Path) -> None:
