@@ -31,7 +31,7 @@ help:
 demo: $(VENV)/.with-rl
 	$(BIN)/python examples/02-es/main.py
 
-## make test          every test; all parts run, and the last lines name those that failed
+## make test          all tests but the long ones; the last lines name the parts that failed
 test: $(VENV)/.with-dev $(VENV)/.with-stable-baselines3 $(VENV)/.with-jax $(VENV)/.with-games $(VENV)/.with-testsuite $(VENV)/.with-browser
 	@PYTHONPATH=tests $(BIN)/python -m announcement $(OTHER_PYTHONS)
 	@failed=; \
