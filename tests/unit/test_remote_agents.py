@@ -15,6 +15,7 @@ from fiber._agent.interface import ChildSpec
 from fiber._backends.remote import RemoteAgent, RemoteChild
 from fiber._transport.link_protocol import Lane
 from fiber._wire import messages
+from fiber._wire.blob_messages import DIGEST_BYTES, Holding
 from fiber._wire.memory_files import BytesLike, share
 from memory_link import SimulatedLoop
 from unit.agent_children import ReadLink, Recorder
@@ -183,7 +184,7 @@ def large() -> tuple[Large, SimulatedLoop, RemoteAgent, RemoteChild, Recorder]:
     agent = RemoteAgent("far", link, loop, nothing, nothing, nothing)  # type: ignore[arg-type]
     child = RemoteChild(agent, ChildSpec("child", "fork", b"", b"", tasks=True), observer)
     child.start()
-    child.signal(signal.SIGTERM)
+    child.signal(signal.SIGUSR1)
     child.deliver(5, b"task")
     child.recall()
     loop.run_for(0)
@@ -200,6 +201,28 @@ def test_a_start_follows_its_blobs_and_a_signal_its_start(large: Any) -> None:
     child.signal(signal.SIGKILL)
     loop.run_for(0)
     assert link.kinds()[5:] == ["Signal"]
+
+
+@pytest.mark.parametrize("signum", [signal.SIGTERM, signal.SIGKILL])
+def test_a_child_is_killed_before_its_blobs_have_left(large: Any, signum: signal.Signals) -> None:
+    link, loop, agent, child, observer = large
+    child.signal(signum)
+    loop.run_for(0)
+    report = observer.wait_for_exit()
+    assert (report.exitcode, report.unread) == (-signum, (5,))
+    assert report.reason == f"killed by {signum.name} before it began"
+    agent._observer.child_gone.assert_called_once_with(agent)
+    link.leaving.pop(0)()
+    assert link.kinds() == ["KeepBlob"]
+
+
+def test_a_lost_agent_is_not_heard(large: Any) -> None:
+    _, _, agent, _, _ = large
+    blobs = mock.Mock()
+    agent.lose("the pod was deleted")
+    agent._blobs = blobs
+    agent.on_frame(bytearray(Holding(bytes(DIGEST_BYTES), 1).encode()))
+    assert not blobs.mock_calls
 
 
 def test_packets_of_a_child_whose_agent_is_lost_before_its_start_are_unread(large: Any) -> None:

@@ -124,8 +124,13 @@ class RemoteAgent:
         self.pod, self.node, self.ending, self.disrupted = pod, node, ending, disrupted
 
     def withdraw(self, child: RemoteChild) -> bool:
-        """Return False: no child waits here."""
-        return False
+        """Forget a child, to which no Start was sent; return False if it is not here."""
+        number = next((number for number, one in self._children.items() if one is child), None)
+        if number is None:
+            return False
+        del self._children[number]
+        self._observer.child_gone(self)
+        return True
 
     def send(self, message: messages.LinkMessage) -> None:
         """Send a message.  Any thread."""
@@ -197,6 +202,8 @@ class RemoteAgent:
 
     def on_frame(self, frame: Frame) -> None:
         """Handle a message of the agent."""
+        if self.lost is not None:
+            return
         message = messages.decode(frame)
         if isinstance(message, messages.HubMessage):
             self._hub_link.on_frame(message)
@@ -385,13 +392,16 @@ class RemoteChild:
     def _ask(self, message: Callable[..., messages.LinkMessage], *fields: int) -> None:
         if self._gone:
             return
-        if self._agent is not None:
-            if self.pid is None and fields and fields[0] in _FATAL:
-                self._ended_by = fields[0]
+        fatal = fields[0] if fields and fields[0] in _FATAL else 0
+        # A child that waits for a host, or for its blobs, which may be large, ends at once.
+        if fatal and self._start is not None and (self._agent or self._starter).withdraw(self):
+            step = "it had a host" if self._agent is None else "it began"
+            name = signal.Signals(fatal).name
+            self.end(ExitReport(-fatal, f"killed by {name} before {step}"))
+        elif self._agent is not None:
+            if self.pid is None and fatal:
+                self._ended_by = fatal
             self._tell(message(self._number, *fields))
-        elif fields and fields[0] in _FATAL and self._starter.withdraw(self):
-            name = signal.Signals(fields[0]).name
-            self.end(ExitReport(-fields[0], f"killed by {name} before it had a host"))
 
     def _tell(self, message: messages.LinkMessage) -> None:
         if self._unasked is not None:
