@@ -105,9 +105,9 @@ class Network:
         self._now = until
 
     def _finish(self, receiver: int) -> None:
-        del self._flows[receiver]
+        flow = self._flows.pop(receiver)
         self._outcome.arrived.add(receiver)
-        self._obey(self._spread.arrived(receiver, serves=True))
+        self._obey(self._spread.arrived(receiver, flow.order.number, serves=True))
 
     def _die(self, agent: int, *, known: bool) -> None:
         if known:

@@ -14,12 +14,13 @@ import pytest
 import census
 import fiber
 from fiber import reduction
-from fiber._agent.blobs import BlobLacking, BlobStore
-from fiber._backends.blobs import BlobSender
+from fiber._agent.blobs import BlobExchange, BlobLacking, BlobStore
+from fiber._backends.blobs import BlobSender, Fanout
+from fiber._engine.fanout import WORTH
 from fiber._runtime import state
 from fiber._runtime.state import SharedArguments
 from fiber._wire import messages
-from fiber._wire.blob_messages import Forget, KeepBlob, Lacking
+from fiber._wire.blob_messages import Forget, Holding, KeepBlob, Lacking, Serve
 from fiber._wire.descriptor import contents
 from fiber._wire.memory_files import Blob
 from memory_link import SimulatedLoop
@@ -32,13 +33,13 @@ LARGE = 3 << 20
 class Sent:
     """Messages to one agent."""
 
-    def __init__(self) -> None:
+    def __init__(self, fanout: Fanout | None = None) -> None:
         self.loop = SimulatedLoop()
         self.messages: list[Any] = []
         self.leaving: list[Callable[[], None] | None] = []
         self.ready: list[str] = []
         """Callers whose blobs have left."""
-        self.parcels = BlobSender(self.loop, self.send)
+        self.parcels = BlobSender(self.loop, self.send, fanout)
 
     def send(
         self, message: messages.LinkMessage, on_left: Callable[[], None] | None = None
@@ -129,6 +130,55 @@ def test_a_blob_that_is_sent_again_has_left_when_both_have() -> None:
     assert sent.ready == []
     sent.leave()
     assert sent.ready == ["", "again"]
+
+
+def test_a_blob_is_kept_while_one_of_two_objects_with_its_content_lives() -> None:
+    sent, first, second = Sent(), Blob(b"content"), Blob(b"content")
+    sent.need(first)
+    sent.need(second)
+    del second
+    assert sent.kinds() == [f"KeepBlob {name(first)}"]
+    del first
+    assert len(sent.kinds()) == 1
+
+
+@pytest.mark.parametrize("report", ["left", "holding"])
+def test_the_report_of_an_order_before_a_forget_is_not_that_of_the_next(report: str) -> None:
+    fanout, data = Fanout(0), bytes(WORTH)
+    sent, other = Sent(fanout), Sent(fanout)
+    blob, again = Blob(data), Blob(data)
+    sent.need(blob, caller="first")
+    (left,) = filter(None, sent.leaving)
+    assert sent.kinds() == [f"KeepBlob {name(blob)}", f"Serve {name(blob)}"]
+    other.need(again)
+    del blob
+    assert [kind.split()[0] for kind in sent.kinds()] == ["Forget"]
+    assert sent.ready == ["first"], "nobody needs it, so nobody waits"
+    sent.need(again, caller="again")
+    if report == "left":
+        left()
+    else:
+        sent.parcels.on_report(Holding(again.digest, 1))
+    assert "again" not in sent.ready
+    (*_, serve) = sent.messages
+    sent.parcels.on_report(Holding(again.digest, serve.number))
+    assert sent.ready == ["first", "again"]
+
+
+@pytest.mark.parametrize("error", [OSError(24, "Too many open files"), RuntimeError("no thread")])
+def test_an_agent_that_cannot_serve_says_that_it_has_the_blob(
+    error: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr("fiber._agent.blobs.BlobSource", refuse)
+    said: list[messages.LinkMessage] = []
+    loop: Any = SimulatedLoop()
+    digest = Blob(b"content").digest
+    exchange = BlobExchange(loop, BlobStore(None), "127.0.0.1", said.append)
+    exchange.serve(Serve(digest, 7, 0))
+    assert said == [Holding(digest, 7)]
 
 
 @pytest.mark.parametrize("data", [b"", b"content"])

@@ -367,3 +367,16 @@ def test_complaints_are_bounded(site: Site, monkeypatch: pytest.MonkeyPatch) -> 
     assert notes.refusals[-1] == "an agent's trouble (10.0.0.99:1)"
     site.on_loop(lambda: None)
     assert len(notes.refusals) == 5
+
+
+def test_an_acceptor_without_a_thread_leaves_nothing_open(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(_: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    before = sorted(os.listdir("/proc/self/fd"))
+    monkeypatch.setattr(threading.Thread, "start", refuse)
+    with pytest.raises(RuntimeError, match="can't start new thread"):
+        acceptor.Acceptor("127.0.0.1:0", site.credentials.certificate)
+    assert sorted(os.listdir("/proc/self/fd")) == before

@@ -39,9 +39,9 @@ class Site:
             self.from_master += order.source is None
 
     def arrive(self, agent: int, *, serves: bool = True) -> None:
-        del self.orders[agent]
+        number = self.orders.pop(agent).number
         self.have.add(agent)
-        self.obey(self.spread.arrived(agent, serves=serves))
+        self.obey(self.spread.arrived(agent, number, serves=serves))
 
     def fail(self, agent: int) -> None:
         self.obey(self.spread.failed(agent, self.orders.pop(agent).number))
@@ -168,6 +168,28 @@ def test_an_agent_that_will_end_serves_no_new_receiver() -> None:
     assert site.have == set(range(20))
 
 
+def test_an_agent_that_will_end_before_it_has_the_blob_serves_no_one() -> None:
+    site = Site(20)
+    first = next(iter(site.orders))
+    site.spread.retire(first)
+    site.arrive(first)
+    while site.orders:
+        assert first not in [order.source for order in site.orders.values()]
+        site.arrive(next(iter(site.orders)))
+    assert site.spread.reachable
+
+
+def test_a_report_of_an_order_that_was_replaced_changes_nothing() -> None:
+    site = Site(3)
+    (first, *_) = site.orders
+    number = site.orders[first].number
+    site.die(first)
+    site.obey(site.spread.want(first))
+    assert site.spread.arrived(first, number, serves=True) == []
+    site.finish()
+    assert site.have == set(range(3))
+
+
 @given(st.integers(1, 40), st.integers(0, 2**32))
 def test_every_agent_that_lives_gets_it_whatever_fails(agents: int, seed: int) -> None:
     site, rng, dead = Site(agents), random.Random(seed), set[int]()
@@ -184,8 +206,8 @@ def test_every_agent_that_lives_gets_it_whatever_fails(agents: int, seed: int) -
             victim = rng.choice([*site.orders, *site.have])
             dead.add(victim)
             site.die(victim)
-        elif site.have:
-            site.spread.retire(rng.choice(list(site.have)))
+        else:
+            site.spread.retire(rng.choice([*site.orders, *site.have]))
         loads = [order.source for order in site.orders.values() if order.source is not None]
         assert all(loads.count(source) <= WIDTH for source in loads)
     site.finish()

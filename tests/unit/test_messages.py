@@ -62,9 +62,9 @@ messages: st.SearchStrategy[LinkMessage] = st.one_of(
     st.builds(Forget, digests),
     st.builds(Leave, st.floats(allow_nan=False), any_text),
     st.builds(Lacking, digests),
-    st.builds(Serve, digests, ids),
+    st.builds(Serve, digests, ids, ids),
     st.builds(Fetch, digests, ids, ids, any_text, any_text, any_text, any_text, ids),
-    st.builds(Holding, digests, any_text, any_text, any_text),
+    st.builds(Holding, digests, ids, any_text, any_text, any_text),
     st.builds(Unfetched, digests, ids, any_text),
     st.builds(Want, digests),
     st.builds(Started, ids, numbers),
@@ -212,8 +212,8 @@ def test_buffers_of_any_item_size_are_taken_by_their_bytes() -> None:
             "uid=<4 characters>, key=<14 characters>, certificate=<4 characters>, port=3)",
         ),
         (
-            Holding(bytes(DIGEST_BYTES), "host:1", SECRET, "hash"),
-            "Holding(digest=<32 bytes>, address=<6 characters>, key=<14 characters>, "
+            Holding(bytes(DIGEST_BYTES), 1, "host:1", SECRET, "hash"),
+            "Holding(digest=<32 bytes>, number=1, address=<6 characters>, key=<14 characters>, "
             "certificate=<4 characters>)",
         ),
         (

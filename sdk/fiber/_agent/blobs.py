@@ -57,6 +57,10 @@ _STEP = 4 << 20
 """Bytes that are hashed in one turn of the loop."""
 
 
+_CANNOT_SERVE = (FiberError, AuthenticationError, OSError, RuntimeError)
+"""Errors of an agent that cannot listen, or that has no descriptor or thread for it."""
+
+
 class BlobLacking(Exception):
     """Error: the agent does not have a blob.  The text says why."""
 
@@ -130,7 +134,7 @@ class BlobExchange:
     def serve(self, message: Serve) -> None:
         """Serve a blob that the master has sent."""
         self._end_fetch(message.digest)
-        self._tell(message.digest, message.port)
+        self._tell(message)
 
     def fetch(self, message: Fetch) -> None:
         """Fetch a blob from another agent."""
@@ -138,7 +142,7 @@ class BlobExchange:
         if self._closed:
             return
         if self._store.find(message.digest) is not None:
-            self._tell(message.digest, message.port)
+            self._tell(message)
             return
         self._fetches[message.digest] = BlobFetch(
             self._loop,
@@ -167,27 +171,28 @@ class BlobExchange:
     def _fetched(self, order: Fetch, message: KeepBlob) -> None:
         self._end_fetch(order.digest)
         self._store.put(message)
-        self._tell(order.digest, order.port)
+        self._tell(order)
 
     def _failed(self, order: Fetch, reason: str) -> None:
         _logs.debug("a blob did not come from %s: %s", order.address, reason)
         self._end_fetch(order.digest)
         self._send(Unfetched(order.digest, order.number, reason))
 
-    def _tell(self, digest: bytes, port: int) -> None:
+    def _tell(self, order: Serve | Fetch) -> None:
         """Tell the master that the blob is here, and how others get it."""
         if self._source is None and self._host and not self._closed:
+            address = join_address(self._host, order.port)
             try:
-                self._source = BlobSource(self._loop, self._store, join_address(self._host, port))
-            except (FiberError, AuthenticationError) as error:
+                self._source = BlobSource(self._loop, self._store, address)
+            except _CANNOT_SERVE as error:
                 _logs.debug("this agent serves no blobs: %s", error)
         source = self._source
         # A blob for which the system has no room is held, too: the child that needs it reports so.
-        if source is None or self._store.find(digest) is None:
-            self._send(Holding(digest))
+        if source is None or self._store.find(order.digest) is None:
+            self._send(Holding(order.digest, order.number))
         else:
             key, certificate = source.credentials.pool_key, source.credentials.fingerprint
-            self._send(Holding(digest, source.address, key, certificate))
+            self._send(Holding(order.digest, order.number, source.address, key, certificate))
 
 
 class BlobSource:

@@ -7,9 +7,10 @@ Each agent has a ``BlobSender``, which knows what the agent has.  The agents of 
 from __future__ import annotations
 
 import ipaddress
+import itertools
 import secrets
 import weakref
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from typing import Protocol
 
@@ -53,11 +54,15 @@ class BlobSender:
         self._loop = loop
         self._send = send
         self._fanout = fanout
-        self._sent: dict[bytes, weakref.ref[Blob]] = {}
+        self._sent: dict[bytes, list[weakref.ref[Blob]]] = {}
+        """Objects with the content of each blob that was sent."""
         self._leaving: dict[bytes, int] = {}
         """Number of times that each blob was sent and has not left."""
-        self._ordered: set[bytes] = set()
-        """Blobs that the fanout brings, and that are not there yet."""
+        self._ordered: dict[bytes, int] = {}
+        """Blobs that the fanout brings and that are not there yet, with the number of the order.
+
+        The number is 0 before the order.
+        """
         self._waiting: list[tuple[list[bytes], Callable[[], None]]] = []
         """Blobs that a caller needs, and the function to call when they have left."""
 
@@ -71,20 +76,22 @@ class BlobSender:
             needed.append(blob.digest)
             if blob.digest not in self._sent:
                 missing.append(blob)
-            # The newest of several with the same content counts.
-            self._sent[blob.digest] = weakref.ref(blob, self._forgetter(blob.digest))
+            self._note(blob)
         for blob in missing:
             self._bring(blob)
         self._waiting.append((needed, then))
         self._go_on()
 
+    def _note(self, blob: Blob) -> None:
+        known = self._sent.setdefault(blob.digest, [])
+        if not any(one() is blob for one in known):
+            known.append(weakref.ref(blob, self._forgetter(blob.digest)))
+
     def _bring(self, blob: Blob) -> None:
         digest = blob.digest
         self._leaving[digest] = self._leaving.get(digest, 0) + 1
         if self._fanout is not None and len(blob.data) >= WORTH:
-            if digest in self._ordered:  # it was forgotten on its way
-                self._leaving[digest] -= 1
-            self._ordered.add(digest)
+            self._ordered[digest] = 0
             self._fanout.want(self, blob)
         else:
             self._send(KeepBlob(digest, blob.data), partial(self._left, digest))
@@ -100,7 +107,7 @@ class BlobSender:
         elif self._fanout is None or message.digest not in self._sent:
             return  # a report that was not asked for, or of a blob that is forgotten
         elif isinstance(message, Holding):
-            self._brought(message.digest)
+            self._brought(message.digest, message.number)
             self._fanout.holding(self, message)
         else:
             self._fanout.unfetched(self, message)
@@ -117,19 +124,25 @@ class BlobSender:
 
     # Orders of the fanout
 
-    def send_copy(self, blob: Blob, port: int) -> None:
+    def send_copy(self, blob: Blob, number: int, port: int) -> None:
         """Send a blob that the agent then serves to others at ``port``."""
-        self._send(KeepBlob(blob.digest, blob.data), partial(self._brought, blob.digest))
-        self._send(Serve(blob.digest, port))
+        self._ordered[blob.digest] = number
+        self._send(KeepBlob(blob.digest, blob.data), partial(self._brought, blob.digest, number))
+        self._send(Serve(blob.digest, number, port))
 
     def order(self, message: Fetch) -> None:
         """Have the agent fetch a blob from another one."""
+        self._ordered[message.digest] = message.number
         self._send(message)
 
-    def _brought(self, digest: bytes) -> None:
-        if digest in self._ordered:
-            self._ordered.discard(digest)
-            self._left(digest)
+    def _brought(self, digest: bytes, number: int) -> None:
+        """Note that an order is carried out, unless a later one has replaced it."""
+        if self._ordered.get(digest) == number:
+            self._end_order(digest)
+
+    def _end_order(self, digest: bytes) -> None:
+        del self._ordered[digest]
+        self._left(digest)
 
     def _left(self, digest: bytes) -> None:
         self._leaving[digest] -= 1
@@ -150,21 +163,24 @@ class BlobSender:
         return lambda _: self._loop.call_soon(self._forget, digest)
 
     def _forget(self, digest: bytes) -> None:
-        reference = self._sent.get(digest)
-        if (
-            reference is not None and reference() is None
-        ):  # else the same blob was made and sent again
-            del self._sent[digest]
-            self._send(Forget(digest))
-            if self._fanout is not None:
-                self._fanout.gone(self, digest)
+        if digest not in self._sent:
+            return
+        self._sent[digest] = [one for one in self._sent[digest] if one() is not None]
+        if self._sent[digest]:
+            return  # another object has the same content
+        del self._sent[digest]
+        self._send(Forget(digest))
+        if self._fanout is not None:
+            self._fanout.gone(self, digest)
+        if digest in self._ordered:
+            self._end_order(digest)
 
 
 class _Spreading:
     """Spread of one blob, and the agents that serve it."""
 
-    def __init__(self, *, reachable: bool) -> None:
-        self.plan: Spread[BlobSender] = Spread(reachable=reachable)
+    def __init__(self, *, reachable: bool, numbers: Iterator[int]) -> None:
+        self.plan: Spread[BlobSender] = Spread(reachable=reachable, numbers=numbers)
         self.blob: Blob | None = None
         """The blob, while an agent needs it; then the master has no need to keep it."""
         self.sources: dict[BlobSender, Holding] = {}
@@ -192,6 +208,10 @@ class Fanout:
     def __init__(self, port: int) -> None:
         self._port = port
         self._blobs: dict[bytes, _Spreading] = {}
+        self._numbers = itertools.count(1)
+        """Numbers of the orders for all blobs."""
+        self._retired: set[BlobSender] = set()
+        """Agents that will end."""
         self._reachable = True
         """False once no agent reached another one: the master serves all."""
 
@@ -199,7 +219,10 @@ class Fanout:
         """Bring a blob to an agent."""
         spreading = self._blobs.get(blob.digest)
         if spreading is None:
-            spreading = self._blobs[blob.digest] = _Spreading(reachable=self._reachable)
+            spreading = _Spreading(reachable=self._reachable, numbers=self._numbers)
+            self._blobs[blob.digest] = spreading
+        if agent in self._retired:
+            spreading.plan.retire(agent)
         spreading.blob = blob
         spreading.agents.add(agent)
         self._carry_out(blob.digest, spreading, spreading.plan.want(agent))
@@ -207,11 +230,11 @@ class Fanout:
     def holding(self, agent: BlobSender, message: Holding) -> None:
         """Note that an agent has a blob."""
         spreading = self._blobs.get(message.digest)
-        if spreading is not None:
+        if spreading is not None and spreading.plan.is_under_way(agent, message.number):
             serves = _is_usable(message)
             if serves:
                 spreading.sources[agent] = message
-            orders = spreading.plan.arrived(agent, serves=serves)
+            orders = spreading.plan.arrived(agent, message.number, serves=serves)
             self._carry_out(message.digest, spreading, orders)
 
     def unfetched(self, agent: BlobSender, message: Unfetched) -> None:
@@ -224,6 +247,7 @@ class Fanout:
 
     def retire(self, agent: BlobSender) -> None:
         """Let an agent serve no new receivers."""
+        self._retired.add(agent)
         for spreading in self._blobs.values():
             spreading.plan.retire(agent)
 
@@ -237,6 +261,7 @@ class Fanout:
 
     def lost(self, agent: BlobSender) -> None:
         """Note that an agent is lost."""
+        self._retired.discard(agent)
         for digest in list(self._blobs):
             self.gone(agent, digest)
 
@@ -247,7 +272,7 @@ class Fanout:
             blob = spreading.blob
             assert blob is not None  # kept while an agent waits
             if source is None:
-                receiver.send_copy(blob, self._port)
+                receiver.send_copy(blob, number, self._port)
             else:
                 receiver.order(self._fetch(blob, number, spreading.sources[source]))
         if not spreading.plan.reachable and self._reachable:

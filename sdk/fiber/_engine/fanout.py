@@ -11,7 +11,8 @@ master sends all copies.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable
+import itertools
+from collections.abc import Hashable, Iterable, Iterator
 from typing import Generic, NamedTuple, TypeVar
 
 WORTH = 1 << 20
@@ -48,10 +49,11 @@ class Transfer(NamedTuple, Generic[_Agent]):
 class Spread(Generic[_Agent]):
     """Spread of one blob.  Each method returns the orders that follow from the event.
 
-    ``reachable``: False if it is known that agents do not reach each other.
+    ``reachable``: False if it is known that agents do not reach each other.  ``numbers``: the
+    numbers of the orders.
     """
 
-    def __init__(self, *, reachable: bool = True) -> None:
+    def __init__(self, *, reachable: bool = True, numbers: Iterator[int] | None = None) -> None:
         self.reachable = reachable
         """False once agents count as unable to reach each other."""
         self._waiting: dict[_Agent, None] = {}
@@ -63,8 +65,10 @@ class Spread(Generic[_Agent]):
         """Agents that have the blob and serve others."""
         self._failures: dict[_Agent, set[_Agent]] = {}
         """Sources that have failed, and the receivers that reported it."""
+        self._retired: set[_Agent] = set()
+        """Agents that will end."""
         self._copies = 0
-        self._orders = 0
+        self._numbers = numbers or itertools.count(1)
         self._in_vain = 0
         """Failures before the first success, and agents that cannot serve."""
         self._proven = False
@@ -81,25 +85,30 @@ class Spread(Generic[_Agent]):
             self._waiting[agent] = None
         return self._assign()
 
-    def arrived(self, agent: _Agent, *, serves: bool) -> list[Transfer[_Agent]]:
-        """Note that an agent has the blob; ``serves``: it can serve others."""
-        self._waiting.pop(agent, None)
+    def is_under_way(self, agent: _Agent, number: int) -> bool:
+        """Tell whether this is the order in force for ``agent``."""
+        transfer = self._under_way.get(agent)
+        return transfer is not None and transfer.number == number
+
+    def arrived(self, agent: _Agent, number: int, *, serves: bool) -> list[Transfer[_Agent]]:
+        """Note that an order is carried out; ``serves``: the agent can serve others."""
+        if not self.is_under_way(agent, number):
+            return []  # a later order has replaced it, or the agent has lost the blob
         transfer = self._end(agent)
         if transfer is not None and transfer.source is not None:
             self._proven = True
-        if serves:
-            self._holders[agent] = None
-        else:
+        if not serves:
             self._count_in_vain()
+        elif agent not in self._retired:
+            self._holders[agent] = None
         return self._assign()
 
     def failed(self, agent: _Agent, number: int) -> list[Transfer[_Agent]]:
         """Note that an order has failed, for the receiver's sake or the source's."""
-        transfer = self._under_way.get(agent)
-        if transfer is None or transfer.number != number:
+        if not self.is_under_way(agent, number):
             return []  # a later order has replaced it
-        self._end(agent)
-        if transfer.source is not None:
+        transfer = self._end(agent)
+        if transfer is not None and transfer.source is not None:
             reporters = self._failures.setdefault(transfer.source, set())
             reporters.add(agent)
             if len(reporters) >= TRIES:  # more than one receiver's fault
@@ -109,12 +118,14 @@ class Spread(Generic[_Agent]):
 
     def retire(self, agent: _Agent) -> None:
         """Note that an agent will end: it serves no new receiver."""
+        self._retired.add(agent)
         self._holders.pop(agent, None)
 
     def gone(self, agent: _Agent) -> list[Transfer[_Agent]]:
         """Note that an agent is lost, or has lost the blob."""
         self._waiting.pop(agent, None)
         self._holders.pop(agent, None)
+        self._retired.discard(agent)
         self._end(agent)
         served = [one.receiver for one in self._under_way.values() if one.source == agent]
         for receiver in served:
@@ -182,8 +193,7 @@ class Spread(Generic[_Agent]):
         return self._copies < COPIES or not self._under_way
 
     def _begin(self, receiver: _Agent, source: _Agent | None) -> Transfer[_Agent]:
-        self._orders += 1
-        transfer = Transfer(receiver, source, self._orders)
+        transfer = Transfer(receiver, source, next(self._numbers))
         self._under_way[receiver] = transfer
         self._serving[source] = self._serving.get(source, 0) + 1
         if source is None:

@@ -101,15 +101,14 @@ class Acceptor:
         descriptors = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
         most = min(_MOST, max(descriptors // 4, 2))
         self._admission = Admission(most, most // 2)
-        try:
-            self._listener = _listen(address)
-        except BaseException:
-            self.loop.stop()
-            raise
-        host = address.rpartition(":")[0].strip("[]")
-        self.address = join_address(host, self._listener.getsockname()[1])
         self._pending: set[PendingConnection] = set()
-        self.loop.start_thread("fiber-accept")
+        with contextlib.ExitStack() as undo:
+            undo.callback(self.loop.stop)
+            self._listener = undo.enter_context(_listen(address))
+            host = address.rpartition(":")[0].strip("[]")
+            self.address = join_address(host, self._listener.getsockname()[1])
+            self.loop.start_thread("fiber-accept")
+            undo.pop_all()
 
     def add(self, pool: ServedPool) -> None:
         """Serve the agents of ``pool`` too.  Any thread."""

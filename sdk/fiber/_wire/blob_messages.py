@@ -76,6 +76,8 @@ class Serve(NamedTuple):
     """Master to agent: serve the blob that came before to other agents, and answer Holding."""
 
     digest: bytes
+    number: int
+    """Number of this order, for Holding."""
     port: int
     """Port to serve at; 0 takes a free one."""
 
@@ -92,7 +94,7 @@ class Fetch(NamedTuple):
 
     digest: bytes
     number: int
-    """Number of this order, for Unfetched."""
+    """Number of this order, for Holding and Unfetched."""
     size: int
     """Bytes of the blob, which bound the time and the memory of the transfer."""
     address: str
@@ -113,9 +115,10 @@ class Fetch(NamedTuple):
 
 
 class Holding(NamedTuple):
-    """Agent to master: the blob is here, and this is how others get it."""
+    """Agent to master: the blob is here, as the order asked, and this is how others get it."""
 
     digest: bytes
+    number: int
     address: str = ""
     """Address for other agents; empty if this one cannot serve."""
     key: str = ""
@@ -181,7 +184,7 @@ def _read_lacking(view: memoryview) -> Lacking:
 
 
 def _read_serve(view: memoryview) -> Serve:
-    return Serve(*_fields(view, int))
+    return Serve(*_fields(view, int, int))
 
 
 def _read_fetch(view: memoryview) -> Fetch:
@@ -189,7 +192,7 @@ def _read_fetch(view: memoryview) -> Fetch:
 
 
 def _read_holding(view: memoryview) -> Holding:
-    return Holding(*_fields(view, str, str, str))
+    return Holding(*_fields(view, int, str, str, str))
 
 
 def _read_unfetched(view: memoryview) -> Unfetched:
