@@ -127,10 +127,9 @@ def test_imported_modules_of_other_folders_on_the_path_are_sent(machine: Machine
 
 
 def test_a_script_in_its_own_package_imports_the_package(machine: Machine) -> None:
+    # The program may have imported the package, or not, as with `fiber run`.
     package = write(machine.lib / "pkg", main_py="", tool_py="")
     machine.runs(package / "main.py")
-    machine.has_imported("pkg", package / "__init__.py", package)
-    machine.has_imported("pkg.tool", package / "tool.py")
     layout = machine.layout(package, machine.lib, STDLIB)
     assert layout.places == {str(package): "pkg"}
     assert layout.paths.before_library == ("pkg", "")

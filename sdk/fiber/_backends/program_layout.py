@@ -126,7 +126,7 @@ def find_layout(
         tuple(dict.fromkeys(tree for tree in path if _is_tree(tree, places))),
         _session(here).intersection(places) if main is None else frozenset(),
         ProgramPaths(
-            *_search_path(places, path, modules),
+            *_search_path(places, path),
             directory=(is_inside(here, program_folder) and places.name_of(here))
             or places.name_of(program_folder)
             or LOOSE,
@@ -148,15 +148,15 @@ def _folder_of(main: str) -> str:
     return folder
 
 
-def _search_path(
-    places: Places, path: list[str], modules: Iterable[_ImportedModule]
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def _search_path(places: Places, path: list[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the entries of the other machine's ``sys.path``, before and after the library.
 
     A package may itself be a place, such as that of a script which lies in its own package.  Then
     the folder of all places stands for the folder around the package.
     """
-    around = {os.path.dirname(each.whole) for each in modules if _is_place(each, places)}
+    around = {
+        os.path.dirname(place) for place, name in places.items() if name == os.path.basename(place)
+    }
 
     def there(entries: list[str]) -> list[str]:
         names = [
@@ -172,10 +172,6 @@ def _search_path(
     if any(name.startswith(f"{LOOSE}/") for name in places.values()):
         before.append(LOOSE)
     return tuple(before), tuple(after)
-
-
-def _is_place(module: _ImportedModule, places: Places) -> bool:
-    return places.get(module.whole) == module.name
 
 
 def _is_offered(folder: str) -> bool:
