@@ -309,7 +309,7 @@ def test_a_walker_that_fails_leaves_what_was_measured(
     monkeypatch.setattr(command, "_problems", lambda *_: [])
     monkeypatch.setattr(command, "_measure", lambda *_: Run({}))
     monkeypatch.setattr(command, "_write", lambda _folder, runs: written.append(list(runs)))
-    monkeypatch.setattr(command.processes, "adopt_orphans", lambda: None)
+    monkeypatch.setattr("benchmarks.processes.adopt_orphans", lambda: None)
     monkeypatch.setattr("signal.signal", lambda *_: None)
     monkeypatch.setattr("subprocess.call", lambda *_, **__: 3)
     arguments = ["--only", "overhead", "walker", "--output", str(tmp_path)]
