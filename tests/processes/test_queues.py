@@ -353,6 +353,30 @@ def get_and_report(queue: Any, taken: Any) -> None:
 
 
 @pytest.mark.slow
+class _Deadly:
+    """Table that kills the process that looks into it."""
+
+    def __getitem__(self, _kind: int) -> int:
+        os.kill(os.getpid(), signal.SIGKILL)
+        raise AssertionError
+
+
+def _die_with_an_item(queue: queues.Queue[str]) -> None:
+    packet._UNITS = _Deadly()  # type: ignore[assignment]  # between the item and its slot
+    queue.get()
+
+
+def test_the_slot_of_a_reader_that_dies_with_its_item_becomes_free() -> None:
+    queue: queues.Queue[str] = fiber.Queue(1)
+    reader = start(_die_with_an_item, queue)
+    queue.put("lost")
+    reader.join()
+    assert reader.exitcode == -signal.SIGKILL
+    queue.put("kept", timeout=PATIENCE)
+    assert queue.get() == "kept"
+    assert queue.qsize() == 0
+
+
 def test_readers_killed_anywhere_take_at_most_the_item_they_hold() -> None:
     queue: Any = fiber.Queue()
     total, killed = 2000, 10

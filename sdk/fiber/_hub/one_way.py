@@ -41,7 +41,13 @@ from fiber._hub import heap
 from fiber._hub.local import LocalChannel, LocalCounter
 from fiber._hub.protocol import ObjectKind
 from fiber._sync.liveness import RobustMutex
-from fiber._transport.channels import BorrowedSocket, connected, wait_readable, wait_until
+from fiber._transport.channels import (
+    BorrowedSocket,
+    Claimant,
+    connected,
+    wait_readable,
+    wait_until,
+)
 from fiber._wire import packet
 from fiber._wire.descriptor import Descriptor
 from fiber._wire.memory_files import BytesLike
@@ -379,12 +385,32 @@ class ReceivingEnd(OneWayEnd):
                 return False
         return True
 
-    def recv_counting(self, counter: LocalCounter, *, wait: bool) -> Message | None:
-        """Receive a message and raise ``counter`` in one step; None if there is no message."""
+    def recv_counting(
+        self, counter: LocalCounter, claims: Claimant, *, wait: bool
+    ) -> Message | None:
+        """Receive a message and raise ``counter`` in one step; None if there is no message.
+
+        A blocking receive would not do.  The kernel gives the message to a receiver that waits,
+        even if it is killed before it runs again.
+        """
         while True:
-            message = self._next(wait=wait, counter=counter)
+            try:
+                claims.add()  # first: after a death there is a record too many, not too few
+                message = self._next(wait=False, counter=counter)
+            finally:
+                claims.drop()
             if message is not None or not wait:
                 return message
+            self._wait()
+
+    def _wait(self) -> None:
+        """Wait until there may be a message or the end, at most ``LOOK_AGAIN`` seconds.
+
+        Each packet wakes one of the receivers that wait, where ``poll`` would wake them all.
+        """
+        if not self.backlog:
+            with contextlib.suppress(BlockingIOError, ConnectionResetError):
+                self._sock.recv(1, socket.MSG_PEEK)
 
     def recv_uncounting(self, counter: LocalCounter, *, wait: bool) -> Message | None:
         """Receive a message and lower ``counter``; None if there is no message."""

@@ -69,8 +69,8 @@ class QueueSlots:
     """Slots of a queue with a maximum size: the count of free ones.
 
     If a process dies before it has sent its items, their slots become free again.  If it dies while
-    it sends an item, the slot of that item may become free too.  Then there is a surplus slot until
-    the queue is empty.
+    it sends or receives an item, one slot may become free too many.  Then there is a surplus slot
+    until the queue is empty.
     """
 
     def __init__(self, maximum: int) -> None:
@@ -115,7 +115,7 @@ class QueueSlots:
 
     def receive(self, inbox: ReceivingChannel, *, wait: bool) -> Message | None:
         """Receive an item and free its slot; None if there is no item."""
-        return inbox.recv_counting(self._free, wait=wait)
+        return inbox.recv_counting(self._free, self._claims, wait=wait)
 
     def used(self, waiting: int) -> int:
         """Return the number of items, of which ``waiting`` wait in this process."""

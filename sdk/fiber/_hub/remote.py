@@ -242,8 +242,13 @@ class RemoteChannel(RemoteObject):
         """Return the next message if there is one; ConnectionClosed at the end."""
         return self._receive(Op.RECV, timeout=0)
 
-    def recv_counting(self, counter: RemoteCounter, *, wait: bool) -> Message | None:
-        """Receive a message, and have the hub raise ``counter``; None if there is no message."""
+    def recv_counting(
+        self, counter: RemoteCounter, claims: Claimant, *, wait: bool
+    ) -> Message | None:
+        """Receive a message, and have the hub raise ``counter``; None if there is no message.
+
+        The hub raises it also if this process dies.
+        """
         timeout = None if wait else 0
         return self._receive(Op.DRAW, counter.known(), form=SECRET, timeout=timeout)
 

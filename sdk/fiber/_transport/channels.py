@@ -116,11 +116,11 @@ class SendingChannel(Channel, Protocol):
 class ReceivingChannel(Channel, Protocol):
     """Channel by which a queue receives its items."""
 
-    def recv_counting(self, counter: Any, *, wait: bool) -> Message | None:
+    def recv_counting(self, counter: Any, claims: Claimant, *, wait: bool) -> Message | None:
         """Receive a message and raise ``counter``, a ``SharedCounter`` of the same host.
 
-        Both happen or none, also if this process is interrupted or dies.  Return None if there is
-        no message.
+        Both happen or none, also if this process is interrupted.  If it dies in between, ``claims``
+        has a record of that.  Return None if there is no message.
         """
 
     def recv_uncounting(self, counter: Any, *, wait: bool) -> Message | None:
