@@ -14,6 +14,7 @@ are the environment's own.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import math
 import os
@@ -231,9 +232,10 @@ def _in_words(test: Test) -> str:
 
 def minutes_of(text: str) -> float:
     """Return the minutes of an option, which are finite.  With 0 the policy is only tested."""
-    if not (math.isfinite(minutes := float(text)) and minutes >= 0):
-        raise argparse.ArgumentTypeError(f"{text} is not a number of minutes, 0 or more")
-    return minutes
+    with contextlib.suppress(ValueError):
+        if math.isfinite(minutes := float(text)) and minutes >= 0:
+            return minutes
+    raise argparse.ArgumentTypeError(f"{text} is not a number of minutes, 0 or more")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -16,11 +16,11 @@ import fiber
 from fiber import reduction
 from fiber._agent.blobs import BlobExchange, BlobLacking, BlobStore
 from fiber._backends.blobs import BlobSender, Fanout
-from fiber._engine.fanout import WORTH
+from fiber._engine.fanout import COPIES, WIDTH, WORTH
 from fiber._runtime import state
 from fiber._runtime.state import SharedArguments
 from fiber._wire import messages
-from fiber._wire.blob_messages import Forget, Holding, KeepBlob, Lacking, Serve
+from fiber._wire.blob_messages import Fetch, Forget, Holding, KeepBlob, Lacking, Serve
 from fiber._wire.descriptor import contents
 from fiber._wire.memory_files import Blob
 from memory_link import SimulatedLoop
@@ -163,6 +163,35 @@ def test_the_report_of_an_order_before_a_forget_is_not_that_of_the_next(report: 
     (*_, serve) = sent.messages
     sent.parcels.on_report(Holding(again.digest, serve.number))
     assert sent.ready == ["first", "again"]
+
+
+def test_a_late_report_of_a_receiver_whose_source_is_lost_is_not_counted() -> None:
+    fanout, blob = Fanout(0), Blob(bytes(WORTH))
+    agents = [Sent(fanout) for _ in range(COPIES + 2 * WIDTH)]
+    for agent in agents:
+        agent.need(blob)
+
+    def order_of(agent: Sent) -> Any:
+        return next((one for one in agent.messages[::-1] if isinstance(one, Serve | Fetch)), None)
+
+    def has_it(agent: Sent) -> None:
+        order = order_of(agent)
+        key = "0" * 64
+        holding = Holding(blob.digest, order.number, "127.0.0.1:1", key, key)
+        agent.parcels.on_report(holding)
+
+    source = agents[0]
+    has_it(source)
+    (receiver, *_) = (agent for agent in agents if isinstance(order_of(agent), Fetch))
+    late = Holding(blob.digest, order_of(receiver).number)
+    source.parcels.close()  # the agent is lost
+    assert order_of(receiver).number == late.number, "it waits for a free source"
+    receiver.parcels.on_report(late)
+    assert receiver.ready == []
+    for agent in agents[1:]:
+        while agent.ready == [] and order_of(agent) is not None:
+            has_it(agent)
+    assert [agent.ready for agent in agents] == [[""]] * len(agents)
 
 
 @pytest.mark.parametrize("error", [OSError(24, "Too many open files"), RuntimeError("no thread")])

@@ -352,7 +352,6 @@ def get_and_report(queue: Any, taken: Any) -> None:
         taken.send(queue.get())
 
 
-@pytest.mark.slow
 class _Deadly:
     """Table that kills the process that looks into it."""
 
@@ -377,6 +376,7 @@ def test_the_slot_of_a_reader_that_dies_with_its_item_becomes_free() -> None:
     assert queue.qsize() == 0
 
 
+@pytest.mark.slow
 def test_readers_killed_anywhere_take_at_most_the_item_they_hold() -> None:
     queue: Any = fiber.Queue()
     total, killed = 2000, 10

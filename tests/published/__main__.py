@@ -16,6 +16,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +29,8 @@ from published.records import Program, programs
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "docs" / "published.json"
 PAGE = ROOT / "docs" / "published.md"
+_END = 60.0
+"""Seconds in which killed processes have ended."""
 
 
 @dataclass(frozen=True)
@@ -152,12 +155,15 @@ def _environment() -> dict[str, str]:
 
 def _end(process: subprocess.Popen[bytes]) -> None:
     """Kill the processes that a run has left in its session, also those of other groups."""
-    while left := _living(process.pid):
+    deadline = time.monotonic() + _END
+    while (left := _living(process.pid)) and time.monotonic() < deadline:
         for pid in left:
-            with contextlib.suppress(ProcessLookupError):
+            with contextlib.suppress(ProcessLookupError, PermissionError):
                 os.kill(pid, signal.SIGKILL)
-        process.poll()
-    process.wait()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(0.05)
+    if left:
+        print(f"published: these processes do not end: {left}", file=sys.stderr)
 
 
 def _living(session: int) -> list[int]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import gc
 import os
 import socket
 import threading
@@ -375,6 +376,7 @@ def test_an_acceptor_without_a_thread_leaves_nothing_open(
     def refuse(_: threading.Thread) -> None:
         raise RuntimeError("can't start new thread")
 
+    gc.collect()
     before = sorted(os.listdir("/proc/self/fd"))
     monkeypatch.setattr(threading.Thread, "start", refuse)
     with pytest.raises(RuntimeError, match="can't start new thread"):

@@ -244,6 +244,7 @@ def test_the_walker_moves_to_the_better_half() -> None:
         (["--rounds", "0"], "0 is less than 1"),
         (["--size", "2"], "2 is not above 0 and up to 1"),
         (["--minutes", "nan"], "nan is not a number of minutes, 0 or more"),
+        (["--minutes", "ten"], "ten is not a number of minutes, 0 or more"),
         (["--minutes", "-1"], "-1 is not a number of minutes, 0 or more"),
     ],
 )

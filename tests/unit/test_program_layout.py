@@ -129,10 +129,18 @@ def test_imported_modules_of_other_folders_on_the_path_are_sent(machine: Machine
 def test_a_script_in_its_own_package_imports_the_package(machine: Machine) -> None:
     # The program may have imported the package, or not, as with `fiber run`.
     package = write(machine.lib / "pkg", main_py="", tool_py="")
+    (package / "__init__.py").touch()
     machine.runs(package / "main.py")
     layout = machine.layout(package, machine.lib, STDLIB)
     assert layout.places == {str(package): "pkg"}
     assert layout.paths.before_library == ("pkg", "")
+
+
+def test_the_folder_around_a_folder_of_scripts_is_not_on_the_path(machine: Machine) -> None:
+    scripts = write(machine.lib / "scripts", main_py="")
+    machine.runs(scripts / "main.py")
+    layout = machine.layout(scripts, machine.lib, STDLIB)
+    assert layout.paths.before_library == ("scripts",)
 
 
 def test_folders_within_one_another_are_sent_once(machine: Machine) -> None:

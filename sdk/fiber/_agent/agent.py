@@ -339,12 +339,15 @@ class LocalChild:
         """Report that the child runs, and begin to receive its packets.
 
         The first answer of a worker may arrive before its zygote reports the start.  It waits, so
-        that the worker's process identifier is known to a caller that has an answer.
+        that the worker's process identifier is known to a caller that has an answer.  The last
+        packets of a worker that ends without such a report do not wait.
         """
         self.pid = pid
         self.release_descriptors()
-        self.observer.started(pid)
-        self.resume()
+        try:
+            self.observer.started(pid)
+        finally:
+            self.resume()
 
     def fork_from(self, zygote: ZygoteLink, hub: HubAddress | None) -> None:
         """Have ``zygote`` start the child; ``hub`` is the address of the host's hub."""

@@ -56,6 +56,8 @@ class BlobSender:
         self._fanout = fanout
         self._sent: dict[bytes, list[weakref.ref[Blob]]] = {}
         """Objects with the content of each blob that was sent."""
+        self._lacking: set[bytes] = set()
+        """Blobs that were sent, and that the agent has lost or could not keep."""
         self._leaving: dict[bytes, int] = {}
         """Number of times that each blob was sent and has not left."""
         self._ordered: dict[bytes, int] = {}
@@ -74,7 +76,8 @@ class BlobSender:
         needed, missing = [], []
         for blob in blobs:
             needed.append(blob.digest)
-            if blob.digest not in self._sent:
+            if blob.digest not in self._sent or blob.digest in self._lacking:
+                self._lacking.discard(blob.digest)
                 missing.append(blob)
             self._note(blob)
         for blob in missing:
@@ -101,13 +104,12 @@ class BlobSender:
         if isinstance(message, Lacking):
             if message.digest in self._ordered:
                 return  # of an earlier start: the blob is on its way again
-            self._sent.pop(message.digest, None)
+            self._lacking.add(message.digest)
             if self._fanout is not None:
                 self._fanout.gone(self, message.digest)
         elif self._fanout is None or message.digest not in self._sent:
             return  # a report that was not asked for, or of a blob that is forgotten
         elif isinstance(message, Holding):
-            self._brought(message.digest, message.number)
             self._fanout.holding(self, message)
         else:
             self._fanout.unfetched(self, message)
@@ -127,7 +129,7 @@ class BlobSender:
     def send_copy(self, blob: Blob, number: int, port: int) -> None:
         """Send a blob that the agent then serves to others at ``port``."""
         self._ordered[blob.digest] = number
-        self._send(KeepBlob(blob.digest, blob.data), partial(self._brought, blob.digest, number))
+        self._send(KeepBlob(blob.digest, blob.data), partial(self.brought, blob.digest, number))
         self._send(Serve(blob.digest, number, port))
 
     def order(self, message: Fetch) -> None:
@@ -135,7 +137,7 @@ class BlobSender:
         self._ordered[message.digest] = message.number
         self._send(message)
 
-    def _brought(self, digest: bytes, number: int) -> None:
+    def brought(self, digest: bytes, number: int) -> None:
         """Note that an order is carried out, unless a later one has replaced it."""
         if self._ordered.get(digest) == number:
             self._end_order(digest)
@@ -169,6 +171,7 @@ class BlobSender:
         if self._sent[digest]:
             return  # another object has the same content
         del self._sent[digest]
+        self._lacking.discard(digest)
         self._send(Forget(digest))
         if self._fanout is not None:
             self._fanout.gone(self, digest)
@@ -231,6 +234,7 @@ class Fanout:
         """Note that an agent has a blob."""
         spreading = self._blobs.get(message.digest)
         if spreading is not None and spreading.plan.is_under_way(agent, message.number):
+            agent.brought(message.digest, message.number)
             serves = _is_usable(message)
             if serves:
                 spreading.sources[agent] = message
@@ -249,7 +253,8 @@ class Fanout:
         """Let an agent serve no new receivers."""
         self._retired.add(agent)
         for spreading in self._blobs.values():
-            spreading.plan.retire(agent)
+            if agent in spreading.agents:
+                spreading.plan.retire(agent)
 
     def gone(self, agent: BlobSender, digest: bytes) -> None:
         """Note that an agent does not have a blob, or needs it no more."""

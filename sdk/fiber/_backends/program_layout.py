@@ -154,9 +154,7 @@ def _search_path(places: Places, path: list[str]) -> tuple[tuple[str, ...], tupl
     A package may itself be a place, such as that of a script which lies in its own package.  Then
     the folder of all places stands for the folder around the package.
     """
-    around = {
-        os.path.dirname(place) for place, name in places.items() if name == os.path.basename(place)
-    }
+    around = {os.path.dirname(place) for place, name in places.items() if _is_package(place, name)}
 
     def there(entries: list[str]) -> list[str]:
         names = [
@@ -172,6 +170,11 @@ def _search_path(places: Places, path: list[str]) -> tuple[tuple[str, ...], tupl
     if any(name.startswith(f"{LOOSE}/") for name in places.values()):
         before.append(LOOSE)
     return tuple(before), tuple(after)
+
+
+def _is_package(place: str, name: str) -> bool:
+    """Tell whether a place is a package that has its own name on the other machine."""
+    return name == os.path.basename(place) and os.path.isfile(os.path.join(place, "__init__.py"))
 
 
 def _is_offered(folder: str) -> bool:

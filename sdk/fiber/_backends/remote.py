@@ -125,11 +125,9 @@ class RemoteAgent:
 
     def withdraw(self, child: RemoteChild) -> bool:
         """Forget a child, to which no Start was sent; return False if it is not here."""
-        number = next((number for number, one in self._children.items() if one is child), None)
-        if number is None:
+        if self._children.pop(child.number, None) is None:
             return False
-        del self._children[number]
-        self._observer.child_gone(self)
+        self.loop.call_soon(self._observer.child_gone, self)
         return True
 
     def send(self, message: messages.LinkMessage) -> None:
@@ -261,7 +259,8 @@ class RemoteChild:
         self._starter = starter
         self._loop = starter.loop
         self._agent: RemoteAgent | None = None
-        self._number = 0
+        self.number = 0
+        """Number of the child at its agent."""
         self._ended_by = 0
         """Fatal signal that was sent to the child before it had started."""
         self._early: list[tuple[int, BytesLike, Sequence[memoryview]]] = []
@@ -310,7 +309,7 @@ class RemoteChild:
 
     def place(self, agent: RemoteAgent, number: int) -> None:
         """Place the child on an agent."""
-        self._agent, self._number, self.host = agent, number, agent.host
+        self._agent, self.number, self.host = agent, number, agent.host
 
     def begin(self) -> None:
         """Send the Start: the agent has all that the child needs."""
@@ -318,7 +317,7 @@ class RemoteChild:
         if start is None or self._agent is None:
             return  # the agent was lost meanwhile
         self._asked = None if self.is_worker else start
-        self._agent.transmit(messages.Start(self._number, *start), self._start_left)
+        self._agent.transmit(messages.Start(self.number, *start), self._start_left)
         early, self._early = self._early, []
         for packet_ in early:
             self.deliver(*packet_)
@@ -338,7 +337,7 @@ class RemoteChild:
         shared = [(at, blob) for at, one in enumerate(buffers) if (blob := shared_blob(one))]
         if not shared and not self._held:
             self._note_delivery(seq)
-            self._agent.transmit(messages.Deliver(self._number, seq, payload, buffers))
+            self._agent.transmit(messages.Deliver(self.number, seq, payload, buffers))
             return True
         packet_ = _HeldPacket(seq, payload, buffers, shared)
         self._held.append(packet_)
@@ -356,7 +355,7 @@ class RemoteChild:
             ready = self._held.popleft()
             self._note_delivery(ready.seq)
             # The blobs are kept until the message has left, so that no Forget passes it.
-            self._agent.transmit(ready.message(self._number), partial(ready.shared.clear))
+            self._agent.transmit(ready.message(self.number), partial(ready.shared.clear))
 
     def _take_held(self) -> list[int]:
         held = [one.seq for one in self._held]
@@ -401,7 +400,7 @@ class RemoteChild:
         elif self._agent is not None:
             if self.pid is None and fatal:
                 self._ended_by = fatal
-            self._tell(message(self._number, *fields))
+            self._tell(message(self.number, *fields))
 
     def _tell(self, message: messages.LinkMessage) -> None:
         if self._unasked is not None:

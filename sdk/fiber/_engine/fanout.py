@@ -87,15 +87,15 @@ class Spread(Generic[_Agent]):
 
     def is_under_way(self, agent: _Agent, number: int) -> bool:
         """Tell whether this is the order in force for ``agent``."""
-        transfer = self._under_way.get(agent)
-        return transfer is not None and transfer.number == number
+        return self._in_force(agent, number) is not None
 
     def arrived(self, agent: _Agent, number: int, *, serves: bool) -> list[Transfer[_Agent]]:
         """Note that an order is carried out; ``serves``: the agent can serve others."""
-        if not self.is_under_way(agent, number):
+        transfer = self._in_force(agent, number)
+        if transfer is None:
             return []  # a later order has replaced it, or the agent has lost the blob
-        transfer = self._end(agent)
-        if transfer is not None and transfer.source is not None:
+        self._end(agent)
+        if transfer.source is not None:
             self._proven = True
         if not serves:
             self._count_in_vain()
@@ -105,10 +105,11 @@ class Spread(Generic[_Agent]):
 
     def failed(self, agent: _Agent, number: int) -> list[Transfer[_Agent]]:
         """Note that an order has failed, for the receiver's sake or the source's."""
-        if not self.is_under_way(agent, number):
+        transfer = self._in_force(agent, number)
+        if transfer is None:
             return []  # a later order has replaced it
-        transfer = self._end(agent)
-        if transfer is not None and transfer.source is not None:
+        self._end(agent)
+        if transfer.source is not None:
             reporters = self._failures.setdefault(transfer.source, set())
             reporters.add(agent)
             if len(reporters) >= TRIES:  # more than one receiver's fault
@@ -134,11 +135,14 @@ class Spread(Generic[_Agent]):
         self._failures.pop(agent, None)
         return [*self._put_first(served), *self._assign()]
 
-    def _end(self, receiver: _Agent) -> Transfer[_Agent] | None:
+    def _in_force(self, agent: _Agent, number: int) -> Transfer[_Agent] | None:
+        transfer = self._under_way.get(agent)
+        return transfer if transfer is not None and transfer.number == number else None
+
+    def _end(self, receiver: _Agent) -> None:
         transfer = self._under_way.pop(receiver, None)
         if transfer is not None:
             self._serving[transfer.source] -= 1
-        return transfer
 
     def _count_in_vain(self) -> None:
         self._in_vain += 1

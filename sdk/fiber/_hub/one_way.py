@@ -394,8 +394,8 @@ class ReceivingEnd(OneWayEnd):
         even if it is killed before it runs again.
         """
         while True:
+            claims.add()  # first: after a death there is a record too many, not too few
             try:
-                claims.add()  # first: after a death there is a record too many, not too few
                 message = self._next(wait=False, counter=counter)
             finally:
                 claims.drop()
@@ -406,7 +406,8 @@ class ReceivingEnd(OneWayEnd):
     def _wait(self) -> None:
         """Wait until there may be a message or the end, at most ``LOOK_AGAIN`` seconds.
 
-        Each packet wakes one of the receivers that wait, where ``poll`` would wake them all.
+        Each packet wakes one of the receivers that wait, where ``poll`` would wake them all.  If
+        that receiver is killed before it takes the packet, the others look a second later.
         """
         if not self.backlog:
             with contextlib.suppress(BlockingIOError, ConnectionResetError):

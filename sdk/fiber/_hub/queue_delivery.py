@@ -4,7 +4,8 @@ A *feeder* sends the items that did not fit into the channel when they were put.
 items and the slots that they take.  A process that puts an item into a bounded queue takes a slot
 for it.  The slot of an item that was sent becomes free when the item is received.  An item that was
 not sent yet is in the memory of its process, and is lost when the process dies.  So each process
-keeps the number of its unsent items in a table in shared memory, where other processes find it.
+keeps the number of its unsent items in a table in shared memory, where other processes find it.  A
+reader that is just taking an item counts there, too, as the slot of that item is not free yet.
 
 A *dealer* sends the items to the readers in turn, before they request them::
 
@@ -69,7 +70,7 @@ class QueueSlots:
     """Slots of a queue with a maximum size: the count of free ones.
 
     If a process dies before it has sent its items, their slots become free again.  If it dies while
-    it sends or receives an item, one slot may become free too many.  Then there is a surplus slot
+    it sends or receives an item, one slot too many may become free.  Then there is a surplus slot
     until the queue is empty.
     """
 
