@@ -6,6 +6,7 @@ import os
 import pickle
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -179,7 +180,13 @@ def test_the_floor_of_a_link_is_measured() -> None:
     assert Order.from_line(order.to_line()) == order
 
 
-def test_a_fake_agent_runs_the_tasks_of_its_child_and_ends_it() -> None:
+def test_a_fake_agent_runs_the_tasks_of_its_child_and_ends_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # The runner replaces these, as its process does nothing else.
+    monkeypatch.setattr("benchmarks.tasks.pretend", None)
+    monkeypatch.setattr("fiber._agent.worker.time", time)
+    monkeypatch.setattr("fiber._agent.batch_results.time", time)
     calls: list[tuple[Callable[..., Any], tuple[Any, ...]]] = []
     heard: list[Any] = []
     loop = SimpleNamespace(
