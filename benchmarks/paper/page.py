@@ -22,7 +22,6 @@ ONCE = "¹"
 """Mark of a value that was measured once, while others were measured in each round."""
 _MARKED = re.compile(r"(<!-- (\w+): begin[^>]*-->\n)(.*?)(<!-- \2: end -->)", re.DOTALL)
 
-
 _RATIO = (
     "A ratio is the median of the ratios of the rounds. It can differ from the ratio of the "
     "medians."

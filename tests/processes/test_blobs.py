@@ -153,7 +153,7 @@ def test_the_report_of_an_order_before_a_forget_is_not_that_of_the_next(report: 
     other.need(again)
     del blob
     assert [kind.split()[0] for kind in sent.kinds()] == ["Forget"]
-    assert sent.ready == ["first"], "nobody needs it, so nobody waits"
+    assert sent.ready == ["first"], "the blob is forgotten, so no caller waits for it"
     sent.need(again, caller="again")
     if report == "left":
         left()

@@ -56,7 +56,6 @@ _LINKS = 8
 _STEP = 4 << 20
 """Bytes that are hashed in one turn of the loop."""
 
-
 _CANNOT_SERVE = (FiberError, AuthenticationError, OSError, RuntimeError)
 """Errors of an agent that cannot listen, or that has no descriptor or thread for it."""
 
