@@ -24,7 +24,8 @@ class Site:
     """Agents of one plan, with the orders that are in force."""
 
     def __init__(self, agents: int, **options: Any) -> None:
-        self.spread: Spread[int] = Spread(**options)
+        self.retired: set[int] = set()
+        self.spread = Spread(retired=self.retired, **options)
         self.orders: dict[int, Transfer[int]] = {}
         self.have: set[int] = set()
         self.from_master = 0
@@ -159,7 +160,7 @@ def test_an_agent_that_will_end_serves_no_new_receiver() -> None:
     site = Site(20)
     first = next(iter(site.orders))
     site.arrive(first)
-    site.spread.retire(first)
+    site.retired.add(first)
     known = {order.number for order in site.orders.values()}
     while site.orders:
         site.arrive(next(reversed(site.orders)))
@@ -171,7 +172,7 @@ def test_an_agent_that_will_end_serves_no_new_receiver() -> None:
 def test_an_agent_that_will_end_before_it_has_the_blob_serves_no_one() -> None:
     site = Site(20)
     first = next(iter(site.orders))
-    site.spread.retire(first)
+    site.retired.add(first)
     site.arrive(first)
     while site.orders:
         assert first not in [order.source for order in site.orders.values()]
@@ -207,7 +208,7 @@ def test_every_agent_that_lives_gets_it_whatever_fails(agents: int, seed: int) -
             dead.add(victim)
             site.die(victim)
         else:
-            site.spread.retire(rng.choice([*site.orders, *site.have]))
+            site.retired.add(rng.choice([*site.orders, *site.have]))
         loads = [order.source for order in site.orders.values() if order.source is not None]
         assert all(loads.count(source) <= WIDTH for source in loads)
     site.finish()

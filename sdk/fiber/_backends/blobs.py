@@ -10,7 +10,7 @@ import ipaddress
 import itertools
 import secrets
 import weakref
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Protocol
 
@@ -182,8 +182,8 @@ class BlobSender:
 class _Spreading:
     """Spread of one blob, and the agents that serve it."""
 
-    def __init__(self, *, reachable: bool, numbers: Iterator[int]) -> None:
-        self.plan: Spread[BlobSender] = Spread(reachable=reachable, numbers=numbers)
+    def __init__(self, plan: Spread[BlobSender]) -> None:
+        self.plan = plan
         self.blob: Blob | None = None
         """The blob, while an agent needs it; then the master has no need to keep it."""
         self.sources: dict[BlobSender, Holding] = {}
@@ -222,10 +222,8 @@ class Fanout:
         """Bring a blob to an agent."""
         spreading = self._blobs.get(blob.digest)
         if spreading is None:
-            spreading = _Spreading(reachable=self._reachable, numbers=self._numbers)
-            self._blobs[blob.digest] = spreading
-        if agent in self._retired:
-            spreading.plan.retire(agent)
+            plan = Spread(reachable=self._reachable, numbers=self._numbers, retired=self._retired)
+            spreading = self._blobs[blob.digest] = _Spreading(plan)
         spreading.blob = blob
         spreading.agents.add(agent)
         self._carry_out(blob.digest, spreading, spreading.plan.want(agent))
@@ -252,9 +250,6 @@ class Fanout:
     def retire(self, agent: BlobSender) -> None:
         """Let an agent serve no new receivers."""
         self._retired.add(agent)
-        for spreading in self._blobs.values():
-            if agent in spreading.agents:
-                spreading.plan.retire(agent)
 
     def gone(self, agent: BlobSender, digest: bytes) -> None:
         """Note that an agent does not have a blob, or needs it no more."""

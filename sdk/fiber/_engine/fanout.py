@@ -12,7 +12,7 @@ master sends all copies.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Hashable, Iterable, Iterator
+from collections.abc import Collection, Hashable, Iterable, Iterator
 from typing import Generic, NamedTuple, TypeVar
 
 WORTH = 1 << 20
@@ -50,10 +50,16 @@ class Spread(Generic[_Agent]):
     """Spread of one blob.  Each method returns the orders that follow from the event.
 
     ``reachable``: False if it is known that agents do not reach each other.  ``numbers``: the
-    numbers of the orders.
+    numbers of the orders.  ``retired``: the agents that will end; they serve no new receiver.
     """
 
-    def __init__(self, *, reachable: bool = True, numbers: Iterator[int] | None = None) -> None:
+    def __init__(
+        self,
+        *,
+        reachable: bool = True,
+        numbers: Iterator[int] | None = None,
+        retired: Collection[_Agent] = frozenset(),
+    ) -> None:
         self.reachable = reachable
         """False once agents count as unable to reach each other."""
         self._waiting: dict[_Agent, None] = {}
@@ -65,8 +71,7 @@ class Spread(Generic[_Agent]):
         """Agents that have the blob and serve others."""
         self._failures: dict[_Agent, set[_Agent]] = {}
         """Sources that have failed, and the receivers that reported it."""
-        self._retired: set[_Agent] = set()
-        """Agents that will end."""
+        self._retired = retired
         self._copies = 0
         self._numbers = numbers or itertools.count(1)
         self._in_vain = 0
@@ -99,7 +104,7 @@ class Spread(Generic[_Agent]):
             self._proven = True
         if not serves:
             self._count_in_vain()
-        elif agent not in self._retired:
+        else:
             self._holders[agent] = None
         return self._assign()
 
@@ -117,16 +122,10 @@ class Spread(Generic[_Agent]):
             self._count_in_vain()
         return [*self._put_first([agent]), *self._assign()]
 
-    def retire(self, agent: _Agent) -> None:
-        """Note that an agent will end: it serves no new receiver."""
-        self._retired.add(agent)
-        self._holders.pop(agent, None)
-
     def gone(self, agent: _Agent) -> list[Transfer[_Agent]]:
         """Note that an agent is lost, or has lost the blob."""
         self._waiting.pop(agent, None)
         self._holders.pop(agent, None)
-        self._retired.discard(agent)
         self._end(agent)
         served = [one.receiver for one in self._under_way.values() if one.source == agent]
         for receiver in served:
@@ -183,7 +182,11 @@ class Spread(Generic[_Agent]):
     def _free_holders(self) -> list[_Agent]:
         if not self.reachable or not self._waiting:
             return []
-        free = [one for one in self._holders if self._serving.get(one, 0) < WIDTH]
+        free = [
+            one
+            for one in self._holders
+            if one not in self._retired and self._serving.get(one, 0) < WIDTH
+        ]
         return sorted(free, key=lambda one: self._serving.get(one, 0))
 
     def _may_serve(self, source: _Agent, receiver: _Agent) -> bool:
