@@ -94,6 +94,10 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("poet.png"), help="the picture")
     options = parser.parse_args()
+    if min(options.iterations, options.pairs) < 1 or options.seed < 0:
+        parser.error("--iterations and --pairs must be at least 1, --seed at least 0")
+    if not options.out.parent.is_dir():
+        parser.error(f"--out {options.out}: there is no folder {options.out.parent}")
     history: list[tuple[dict[int, float], int]] = []
     with fiber.Manager() as manager:
         pairs, sizes = manager.dict(), {"min_workers": 1, "max_workers": options.pairs}

@@ -67,7 +67,7 @@ def draw(path: Path, found_in: dict[Any, int], curves: list[list[float]]) -> Non
     x, y, keys = map(np.array, zip(*found_in, strict=True))
     dots = vault.scatter(2 * x + 0.3 + 0.6 * keys, 2 * y + 0.5, c=[*found_in.values()], s=14)
     figure.colorbar(dots, ax=vault, label="found in round", shrink=0.7)
-    success.plot(np.arange(len(curves[0])) * 5, np.transpose(curves))
+    success.plot(np.linspace(0, 100, len(curves[0]), False), np.transpose(curves))
     success.set(xlabel="training, percent", ylabel="success with sticky moves")
     figure.savefig(path)
 
@@ -81,6 +81,10 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("go-explore.png"), help="the picture")
     options = parser.parse_args()
+    if min(options.rounds, options.workers, options.policies, options.episodes) < 1:
+        parser.error("--rounds, --workers, --policies and --episodes must be at least 1")
+    if not options.out.parent.is_dir():
+        parser.error(f"--out {options.out}: there is no folder {options.out.parent}")
     found_in, way = phase_1(options)
     if not way:
         sys.exit("The treasure was not found. More --rounds, or another --seed, may find it.")

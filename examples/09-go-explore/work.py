@@ -42,7 +42,7 @@ def robustify(way: Way, episodes: int, seed: int) -> tuple[Policy, list[float]]:
         if success > 0.5 and len(starts) > 1:
             del starts[max(len(starts) - 2, 1) :]
             success -= 0.2
-        if episode % (episodes // 20) == 0:
+        if episode % max(1, episodes // 20) == 0:
             curve.append(sum(play(policy, rng) for _ in range(40)) / 40)
     return policy, curve
 

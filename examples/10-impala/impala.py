@@ -55,7 +55,7 @@ def train(learner: Learner, weights: list[Any], unrolls: Any, updates: int) -> A
         for unroll in batch:
             weights[unroll.actor].put((learner.version, learner.weights))
             episodes += [(steps, total, lag) for total in unroll.returns]
-        if update % (updates // 10) == 0:
+        if update % max(1, updates // 10) == 0:
             mean = np.mean([total for _, total, _ in episodes[-50:]])
             print(f"update {update}: {steps:,} steps, mean return {mean:.1f}, lag {lag:.1f}")
     return np.array(episodes)
@@ -83,9 +83,18 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("impala.png"), help="the picture")
     options = parser.parse_args()
-    env: Any = gym.make(options.env)
-    inputs, actions = env.observation_space.shape[0], int(env.action_space.n)
-    learner = Learner(new_weights(inputs, actions, options.seed))
+    if min(options.actors, options.updates) < 1 or options.seed < 0:
+        parser.error("--actors and --updates must be at least 1, --seed at least 0")
+    if not options.out.parent.is_dir():
+        parser.error(f"--out {options.out}: there is no folder {options.out.parent}")
+    try:
+        env: Any = gym.make(options.env)
+    except gym.error.Error as error:
+        parser.error(f"--env {options.env}: {error}")
+    shape = env.observation_space.shape or ()
+    if len(shape) != 1 or not isinstance(env.action_space, gym.spaces.Discrete):
+        parser.error(f"--env {options.env}: observations must be vectors, and actions Discrete")
+    learner = Learner(new_weights(shape[0], int(env.action_space.n), options.seed))
     unrolls: Any = fiber.Queue(2 * options.actors)  # bounded: fast actors wait for the learner
     weights: list[Any] = [fiber.Queue() for _ in range(options.actors)]
     actors = [
