@@ -75,26 +75,16 @@ def run(bench: Bench, agents: int, size: float) -> dict[str, float]:
 
 def _with_links(bench: Bench, agents: int, size: float) -> dict[str, float]:
     # Imported here, because only Fiber's process needs it installed.
-    from benchmarks.fake_cluster import FakeCluster, agent_hosts
+    from benchmarks.fake_cluster import joined_cluster
 
-    from fiber._runtime.state import runtime, shutdown
-
-    with agent_hosts() as hosts:
-        ours = runtime()
-        ours.backend.close()
-        try:
-            cluster = FakeCluster(ours, hosts, agents)
-            ours.backend = cluster
-            cluster.join()
-            return {
-                JOINED.name: cluster.joined,
-                JOINING.name: cluster.joining,
-                MEMORY.name: cluster.master_memory,
-                AGENT_MEMORY.name: cluster.agent_memory,
-                **_rates(bench, agents, size),
-            }
-        finally:
-            shutdown()
+    with joined_cluster(agents) as cluster:
+        return {
+            JOINED.name: cluster.joined,
+            JOINING.name: cluster.joining,
+            MEMORY.name: cluster.master_memory,
+            AGENT_MEMORY.name: cluster.agent_memory,
+            **_rates(bench, agents, size),
+        }
 
 
 def _rates(bench: Bench, workers: int, size: float) -> dict[str, float]:

@@ -148,8 +148,7 @@ def _watched() -> Iterator[Budget]:
 
 
 def _executors() -> Iterator[Budget]:
-    """Return the budgets of executors: issue 11 asks for five times concurrent.futures; loky and
-    loops were added."""
+    """Return the budgets of executors and parallel loops, against other executors."""
 
     def budget(what: str, measure: str, case: str, bound: float, **rivals: str) -> Budget:
         return Budget(what, measure, case, executors.RATE.name, bound, at_least=True, **rivals)
@@ -201,8 +200,7 @@ def _pipes() -> Iterator[Budget]:
 
 
 def _vector() -> Iterator[Budget]:
-    """Return the budgets of issue 11; where it names no number of environments, the number of
-    CartPoles."""
+    """Return the budgets of vector environments."""
 
     def budget(what: str, case: str, bound: float, **more: Any) -> Budget:
         rate = vector.RATE.name
@@ -308,7 +306,7 @@ def _remote() -> Iterator[Budget]:
     rate = throughput.RATE
     for case in ("apply_async", f"apply_async, {throughput.OF_MAIN}"):
         yield budget(f"no-ops: {case}", "throughput", case, rate, 1, at_least=True)
-    yield from _kinds_of_functions()
+    yield from _kinds_of_functions("loopback: ", "fiber-loopback", "fiber-executor-loopback")
     what = "no-op tasks, chunksize 1"
     yield budget(what, "throughput", "map, chunksize 1", rate, 20, at_least=True)
     for case in throughput.ARRAY_KINDS:
@@ -318,17 +316,21 @@ def _remote() -> Iterator[Budget]:
         yield budget(case, "overhead", case, overhead.TIME, 1.02)
 
 
-def _kinds_of_functions() -> Iterator[Budget]:
+def _kinds_of_functions(prefix: str, pool: str, executor: str) -> Iterator[Budget]:
     """Return the bounds of calls of other functions, to calls of an importable one."""
-    ours: Any = {"contender": "fiber-loopback"}
     for kind in (throughput.OF_MAIN, throughput.BY_VALUE):
-        what = f"loopback: latency of one apply, {kind}, p50, to an importable one"
+        what = f"{prefix}latency of one apply, {kind}, p50, to an importable one"
         metric, case = latency.P50.name, f"apply, {kind}"
+        ours: Any = {"contender": pool}
         yield Budget(what, "latency", case, metric, 1.2, to_case=latency.NAME, **ours)
-        what = f"loopback: no-ops: apply_async, {kind}, to an importable one"
+        what = f"{prefix}no-ops: apply_async, {kind}, to an importable one"
         metric, case = throughput.RATE.name, f"apply_async, {kind}"
-        more: Any = {"to_case": "apply_async", "at_least": True, **ours}
-        yield Budget(what, "throughput", case, metric, 0.83, **more)
+        ours |= {"to_case": "apply_async", "at_least": True}
+        yield Budget(what, "throughput", case, metric, 0.83, **ours)
+        what = f"{prefix}no-ops: submit, {kind}, to an importable one"
+        metric, case = executors.RATE.name, executors.SUBMIT_OF[kind]
+        ours |= {"to_case": executors.SUBMIT, "contender": executor}
+        yield Budget(what, "executors", case, metric, 0.83, **ours)
 
 
 def _endings() -> Iterator[Budget]:
@@ -394,6 +396,7 @@ def _on_pods() -> Iterator[Budget]:
     yield budget("no-op tasks, chunksize 1", "throughput", case, throughput.RATE, 10, at_least=True)
     what = "latency of one apply, p50"
     yield budget(what, "latency", latency.NAME, latency.P50, 3)
+    yield from _kinds_of_functions("", "fiber-kubernetes", "fiber-executor-kubernetes")
     for case in throughput.ARRAY_KINDS:
         yield budget(case, "throughput", case, throughput.TIME, 1)
     # As for processes of one machine: slow pods delay no other pod.

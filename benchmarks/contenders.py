@@ -118,6 +118,15 @@ ALL = (
         environment={"FIBER_BACKEND": "local"},
     ),
     Contender(
+        "fiber-executor-loopback",
+        "fiber.Executor, loopback agents",
+        ("fiber",),
+        EXECUTOR,
+        "#56B4E9",
+        "v",
+        environment={"FIBER_BACKEND": "loopback"},
+    ),
+    Contender(
         "fiber-joblib",
         "joblib on Fiber",
         ("fiber", "joblib"),

@@ -6,9 +6,10 @@ from collections.abc import Iterable
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from benchmarks.latency import NOT_BY_VALUE
 from benchmarks.model import WORKERS, Case, Metric
-from benchmarks.tasks import after, no_op
-from benchmarks.throughput import rate
+from benchmarks.tasks import after
+from benchmarks.throughput import BY_VALUE, OF_MAIN, rate
 
 if TYPE_CHECKING:
     from benchmarks.contender import Bench
@@ -17,25 +18,29 @@ TITLE = "Executors"
 ABOUT = f"""\
 {WORKERS} workers of a concurrent.futures.Executor, each library with its own executor; loky is the
 one within joblib. Tasks return their argument, an int, at once or after a sleep of a millisecond.
-`submit` is one call for each task, and then all results. `map` has chunksize 1 unless the case says
-otherwise. Dask has `Client.submit` and `Client.map`, which have no chunks, and Ray `apply_async`
-and `map` of its Pool. Both get a tenth of the no-op tasks. The value of a round is the median of up
-to five batches in a row."""
+`submit` is one call for each task, and then all results. Its function is one of an importable
+module, or of the main module, or a lambda, which travels by value. `map` has chunksize 1 unless the
+case says otherwise. Dask has `Client.submit` and `Client.map`, which have no chunks, and Ray
+`apply_async` and `map` of its Pool. Both get a tenth of the no-op tasks. The value of a round is
+the median of up to five batches in a row."""
 
 RATE = Metric("rate", "tasks a second", "1/s")
 BASELINE = "concurrent.futures"
 SUBMIT = "submit, no-ops"
+SUBMIT_OF = {kind: f"submit, {kind}" for kind in (OF_MAIN, BY_VALUE)}
 MAP = "map, no-ops"
 IN_CHUNKS = "map, no-ops, chunksize 100"
 SLEEPING = "submit, 1 ms tasks"
 _CHUNKS = "executor in chunks"
 
-# Name, ability, chunk size (0: submit), seconds of a task, tasks.
+# Name, ability, chunk size (0: submit), seconds of a task, tasks, the no-op.
 _CASES = (
-    (SUBMIT, "executor", 0, 0.0, 5_000),
-    (MAP, "executor", 1, 0.0, 5_000),
-    (IN_CHUNKS, _CHUNKS, 100, 0.0, 100_000),
-    (SLEEPING, "executor", 0, 0.001, 1_000),
+    (SUBMIT, "executor", 0, 0.0, 5_000, "no_op"),
+    (SUBMIT_OF[OF_MAIN], "executor", 0, 0.0, 5_000, "of_main"),
+    (SUBMIT_OF[BY_VALUE], "executor", 0, 0.0, 5_000, "by_value"),
+    (MAP, "executor", 1, 0.0, 5_000, "no_op"),
+    (IN_CHUNKS, _CHUNKS, 100, 0.0, 100_000, "no_op"),
+    (SLEEPING, "executor", 0, 0.001, 1_000, "no_op"),
 )
 
 
@@ -51,23 +56,27 @@ def cases(size: float) -> list[Case]:
                 "chunksize": chunksize,
                 "seconds": seconds,
                 "tasks": max(100, round(tasks * size)),
+                "function": function,
             },
             metrics=(RATE,),
             baseline=BASELINE,
             limit=30.0,
+            not_run=NOT_BY_VALUE if function == "by_value" else {},
         )
-        for name, needs, chunksize, seconds, tasks in _CASES
+        for name, needs, chunksize, seconds, tasks, function in _CASES
     ]
 
 
-def run(bench: Bench, chunksize: int, seconds: float, tasks: int) -> dict[str, float]:
+def run(
+    bench: Bench, chunksize: int, seconds: float, tasks: int, function: str
+) -> dict[str, float]:
     """Return tasks a second."""
-    function = partial(after, seconds) if seconds else no_op
+    called = partial(after, seconds) if seconds else getattr(bench, function)
 
     def batch(count: int) -> Iterable[Any]:
         if chunksize:
-            return bench.pool.map(function, range(count), chunksize)
-        return bench.pool.submit(function, range(count))
+            return bench.pool.map(called, range(count), chunksize)
+        return bench.pool.submit(called, range(count))
 
     batch(WORKERS)
     few = not bench.light and not seconds

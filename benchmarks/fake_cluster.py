@@ -22,7 +22,7 @@ from fiber._backends.blobs import Fanout
 from fiber._backends.remote import RemoteAgent, RemoteChild
 from fiber._engine.placement import Placement
 from fiber._logs import OutputWriter
-from fiber._runtime.state import Runtime
+from fiber._runtime.state import Runtime, runtime, shutdown
 from fiber._transport.credentials import make_credentials
 from fiber._transport.link import Link
 from fiber._transport.listener import MasterListener
@@ -155,6 +155,22 @@ class FakeCluster:
     def _fail(self, reason: str) -> None:
         self._problem = reason
         self._all_joined.set()
+
+
+@contextmanager
+def joined_cluster(
+    agents: int, *, hosts: int = HOSTS, fanout: Fanout | None = None
+) -> Iterator[FakeCluster]:
+    """Make a cluster whose agents have joined Fiber's backend; end Fiber afterwards."""
+    with agent_hosts(hosts) as processes_of_agents:
+        ours = runtime()
+        ours.backend.close()
+        try:
+            ours.backend = cluster = FakeCluster(ours, processes_of_agents, agents, fanout)
+            cluster.join()
+            yield cluster
+        finally:
+            shutdown()
 
 
 @contextmanager

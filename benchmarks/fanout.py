@@ -16,11 +16,10 @@ import threading
 import time
 from typing import NamedTuple
 
-from benchmarks.fake_cluster import FakeCluster, agent_hosts
+from benchmarks.fake_cluster import FakeCluster, joined_cluster
 from benchmarks.fanout_model import Network
 
 from fiber._backends.blobs import BlobSender, Fanout
-from fiber._runtime import state
 from fiber._wire.blob_messages import Holding
 from fiber._wire.memory_files import Blob
 
@@ -90,23 +89,15 @@ def measure(agents: int, size: int, *, passing_on: bool) -> Figures:
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
     fanout = _CountingFanout(agents, passing_on=passing_on)
     blob = Blob(os.urandom(size))
-    with agent_hosts() as hosts:
-        ours = state.runtime()
-        ours.backend.close()
-        try:
-            cluster = FakeCluster(ours, hosts, agents, fanout)
-            ours.backend = cluster
-            cluster.join()
-            before = _sent(cluster)
-            began = time.perf_counter()
-            for agent in cluster.agents:
-                agent.loop.call_soon(agent._blobs.send_missing, [blob], lambda: None)
-            if not fanout.complete.wait(_TIMEOUT):
-                raise TimeoutError(f"{fanout._missing} of {agents} agents did not get the blob")
-            seconds = time.perf_counter() - began
-            return Figures((_sent(cluster) - before) / size, seconds)
-        finally:
-            state.shutdown()
+    with joined_cluster(agents, fanout=fanout) as cluster:
+        before = _sent(cluster)
+        began = time.perf_counter()
+        for agent in cluster.agents:
+            agent.loop.call_soon(agent._blobs.send_missing, [blob], lambda: None)
+        if not fanout.complete.wait(_TIMEOUT):
+            raise TimeoutError(f"{fanout._missing} of {agents} agents did not get the blob")
+        seconds = time.perf_counter() - began
+        return Figures((_sent(cluster) - before) / size, seconds)
 
 
 def _sent(cluster: FakeCluster) -> int:

@@ -37,9 +37,21 @@ MEASURES: dict[str, ModuleType] = {
 PAGE, PICTURE, RESULTS = "kubernetes.md", "kubernetes.png", "kubernetes.json"
 NOTES = "kubernetes-notes.md"
 """Page that is written by hand."""
+_KINDS = (throughput.OF_MAIN, throughput.BY_VALUE)
 _OF_ONE_HOST = {
-    "throughput": ("map, chunksize 1", "map, default chunks", *throughput.ARRAY_KINDS),
-    "executors": (executors.SUBMIT, executors.MAP, executors.SLEEPING),
+    "throughput": (
+        "map, chunksize 1",
+        "map, default chunks",
+        "apply_async",
+        *(f"apply_async, {kind}" for kind in _KINDS),
+        *throughput.ARRAY_KINDS,
+    ),
+    "executors": (
+        executors.SUBMIT,
+        *executors.SUBMIT_OF.values(),
+        executors.MAP,
+        executors.SLEEPING,
+    ),
     "pipes": (pipes.environments(8),),
     "vector": (
         vector.pixels(64),

@@ -298,6 +298,7 @@ def processes_of(contender: str) -> Any:
 _ADAPTERS: dict[str, Callable[[int], Adapter]] = {
     "concurrent.futures": lambda workers: Futures(futures.ProcessPoolExecutor(workers)),
     "fiber-executor": fiber_executor,
+    "fiber-executor-loopback": fiber_executor,
     "fiber-executor-kubernetes": fiber_executor,
     "loky": lambda workers: Futures(
         import_module("joblib.externals.loky").ProcessPoolExecutor(workers)

@@ -18,8 +18,9 @@ if TYPE_CHECKING:
 TITLE = "Sharing"
 ABOUT = """\
 Queue: an int goes to another process by one `Queue` and comes back by a second. A stream of 20,000
-ints comes from another process as fast as it can be read. Arrays of 1 MB, and of 0.8 MB from two
-processes at a time, come by a `Queue` too, and one byte of each page is read. Manager call: one
+ints comes from another process as fast as it can be read, and one of 5,000 goes to another process.
+Arrays of 1 MB, and of 0.8 MB from two processes at a time, come by a `Queue` too, and one byte of
+each page is read. Pipe: 5,000 ints come from another process. Manager call: one
 `get` of a dict of `Manager()`. Lock, Value: `with lock`, and
 `with value.get_lock(): value.value += 1`, by this process alone, and by four processes at a time
 (the time divided by the number of all steps). Array: another process writes all of an `Array` by
@@ -34,6 +35,8 @@ QUEUES, CALLS, ARRAYS, BARRIERS = "queue", "lock, value, manager", "array", "bar
 STREAM_OF_ARRAYS = "queue, stream of 1 MB arrays"
 TWO_PRODUCERS = "queue, two producers of 0.8 MB"
 ROUND_TRIP, STREAM = "queue, round trip of an int", "queue, stream of ints"
+STREAM_AWAY = "queue, stream of ints to another process"
+PIPE = "pipe, stream of ints"
 MANAGER, LOCK, VALUE = "manager call", "with lock", "Value += 1"
 CONTENDED = "Value += 1, four processes"
 BARRIERS_OF = {5: "barrier of 5", 8: "barrier of 8"}
@@ -52,6 +55,8 @@ def cases(size: float) -> list[Case]:
     kinds: list[tuple[str, str, Metric, dict[str, Any], int]] = [
         (QUEUES, ROUND_TRIP, CALL, {"what": "round_trip"}, 3000),
         (QUEUES, STREAM, RATE, {"what": "stream"}, 20_000),
+        (QUEUES, STREAM_AWAY, RATE, {"what": "stream_away"}, 5000),
+        (QUEUES, PIPE, RATE, {"what": "pipe"}, 5000),
         (QUEUES, STREAM_OF_ARRAYS, BYTES, {"what": "arrays", "nbytes": 1_000_000}, 300),
         (
             QUEUES,
@@ -152,6 +157,45 @@ def _stream(processes: Any, stack: ExitStack, count: int) -> dict[str, float]:
     begin = time.perf_counter()
     for _ in range(count - 1):
         queue.get()
+    return {RATE.name: (count - 1) / (time.perf_counter() - begin)}
+
+
+def _take_all(queue: Any, done: Any, count: int) -> None:
+    queue.get()
+    done.send(None)
+    for _ in range(count):
+        queue.get()
+    done.send(None)
+
+
+def _stream_away(processes: Any, stack: ExitStack, count: int) -> dict[str, float]:
+    queue = processes.Queue()
+    done, there = processes.Pipe()
+    _start(processes, stack, _take_all, queue, there, count)
+    queue.put(0)
+    done.recv()
+    begin = time.perf_counter()
+    for item in range(count):
+        queue.put(item)
+    done.recv()
+    return {RATE.name: count / (time.perf_counter() - begin)}
+
+
+def _send_all(connection: Any, count: int) -> None:
+    connection.recv()
+    for item in range(count):
+        connection.send(item)
+    connection.recv()
+
+
+def _pipe(processes: Any, stack: ExitStack, count: int) -> dict[str, float]:
+    here, there = processes.Pipe()
+    _start(processes, stack, _send_all, there, count)
+    here.send(None)
+    here.recv()
+    begin = time.perf_counter()
+    for _ in range(count - 1):
+        here.recv()
     return {RATE.name: (count - 1) / (time.perf_counter() - begin)}
 
 
@@ -271,6 +315,8 @@ def _barrier(processes: Any, stack: ExitStack, count: int, parties: int) -> dict
 _MEASURES: dict[str, Callable[..., dict[str, float]]] = {
     "round_trip": _round_trip,
     "stream": _stream,
+    "stream_away": _stream_away,
+    "pipe": _pipe,
     "arrays": _arrays,
     "manager": _manager,
     "lock": _lock,

@@ -2,7 +2,8 @@
 
 One environment a worker, as in the paper. With `played` games the workers run the emulator. With
 `recorded` ones a step takes as long as a recorded step and no processor, so that two processors
-have room for hundreds. The learner is small, a linear policy in NumPy: collection is measured.
+have room for hundreds. The learner is small, a linear policy in NumPy, so that nearly all of the
+time is that of the steps.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ SUBPROC_MODULE = "stable_baselines3.common.vec_env.subproc_vec_env"
 _QUICK_WORKERS = (2, 4)
 
 TIME = Metric("time", "time of all steps", "s")
-COLLECTION = Metric("collection", "of which collection", "s")
+COLLECTION = Metric("collection", "time of the steps alone", "s")
 
 
 def recorded(count: int) -> str:
@@ -66,7 +67,7 @@ def cases(size: float) -> list[Case]:
 
 
 def run(bench: Bench, kind: str, workers: int, steps: int) -> dict[str, float]:
-    """Return seconds of so many steps with learning, and of their collection alone."""
+    """Return seconds of so many steps with learning, and of the steps alone."""
     from benchmarks.paper import atari, ppo
 
     make: Callable[[], Any] = getattr(atari, kind)

@@ -117,7 +117,7 @@ def _chosen(cases: Sequence[Case], workers: list[int] | None) -> list[Case]:
 def _able(contenders: Sequence[Contender]) -> tuple[list[Contender], dict[str, str]]:
     skipped = {each.name: missing for each in contenders if (missing := each.missing())}
     for name, missing in skipped.items():
-        say(f"{name} is skipped, because {missing} is not installed")
+        say(f"{name} is skipped: {missing} is not installed; make paper installs what it needs")
     return [each for each in contenders if each.name not in skipped], skipped
 
 
@@ -139,7 +139,8 @@ def _write(folder: Path, runs: dict[str, Run]) -> None:
     data = {name: runs[name].as_json() for name in PARTS if name in runs}
     text = json.dumps(data, separators=(",", ":")) + "\n"
     (folder / page.RESULTS).write_text(text, encoding="utf-8")
-    pictures.draw(runs, folder)
+    if folder != page.FOLDER / page.PODS:  # the page has tables of pods, and no pictures
+        pictures.draw(runs, folder)
     say(f"written to {page.write(folder, runs)}")
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from benchmarks import overhead, report
-from benchmarks.contenders import BY_NAME
+from benchmarks.contenders import BY_NAME, ON_HOSTS
 from benchmarks.model import Case, Metric, Run
 from benchmarks.paper import breakout, evolution, populations_results, walker
 from benchmarks.paper.parts import PARTS
@@ -18,6 +18,8 @@ from benchmarks.session import ROOT
 FOLDER = ROOT / "docs" / "paper"
 PAGE = ROOT / "docs" / "paper.md"
 RESULTS = "results.json"
+PODS = "pods"
+"""Folder, beside the results, of runs with a cluster on the same machine."""
 ONCE = "¹"
 """Mark of a value that was measured once, while others were measured in each round."""
 _MARKED = re.compile(r"(<!-- (\w+): begin[^>]*-->\n)(.*?)(<!-- \2: end -->)", re.DOTALL)
@@ -34,11 +36,12 @@ def load(folder: Path) -> dict[str, Run]:
 
 
 def write(folder: Path, runs: Mapping[str, Run]) -> Path:
-    """Fill the page from the results of its folder; beside other results, write tables.md."""
-    texts = generated(folder, runs)
-    if folder == FOLDER:
+    """Fill the page from the results of its folders; beside other results, write tables.md."""
+    if folder in (FOLDER, FOLDER / PODS):
+        texts = generated(FOLDER, load(FOLDER))
         PAGE.write_text(filled(PAGE.read_text(encoding="utf-8"), texts), encoding="utf-8")
         return PAGE
+    texts = generated(folder, runs)
     path = folder / "tables.md"
     path.write_text("\n\n".join(texts.values()) + "\n", encoding="utf-8")
     return path
@@ -47,6 +50,8 @@ def write(folder: Path, runs: Mapping[str, Run]) -> Path:
 def generated(folder: Path, runs: Mapping[str, Run]) -> dict[str, str]:
     """Return the generated text of each part that has results."""
     texts = {name: _TEXTS[name](runs[name]) for name in PARTS if name in runs}
+    on_pods = load(folder / PODS)
+    texts |= {f"{name}_{PODS}": _TEXTS[name](on_pods[name]) for name in PARTS if name in on_pods}
     if (folder / walker.RESULTS).exists():
         texts["walker"] = _walker(walker.load(folder))
     if (folder / populations_results.RESULTS).exists():
@@ -80,7 +85,7 @@ def _short(case: Case) -> str:
 
 
 def _evolution(run: Run) -> str:
-    cases = evolution.cases(run.about["size"])
+    cases = _measured(run, evolution.cases(run.about["size"]))
     names = _present(run, cases)
     head = ["workers", "bound", *(BY_NAME[name].label for name in names)]
     rows = [
@@ -96,7 +101,22 @@ def _evolution(run: Run) -> str:
         f"{iterations} iteration{'s' * (iterations != 1)} of {cases[0].params['population']:,} "
         "episodes. In parentheses: the bound divided by the time (1 is the best possible)."
     )
-    return _text(run, report.table(head, rows), note)
+    return _text(run, report.table(head, rows), note + _own_times(run, cases))
+
+
+def _own_times(run: Run, cases: Sequence[Case]) -> str:
+    """Return a sentence on the processor time of the program itself, with pretended hosts."""
+    used = {
+        f"{case.params['workers']:,}": in_words(found.median / case.params["iterations"], "s")
+        for case in cases
+        if (found := _found(run, case, ON_HOSTS.name, evolution.OWN))
+    }
+    if not used:
+        return ""
+    return (
+        f" {ON_HOSTS.label}: for an iteration with {', '.join(used)} workers, the program itself "
+        f"used {', '.join(used.values())} of processor time."
+    )
 
 
 def _with_efficiency(run: Run, case: Case, name: str) -> str:
@@ -108,7 +128,7 @@ def _with_efficiency(run: Run, case: Case, name: str) -> str:
 
 
 def _breakout(run: Run) -> str:
-    cases = breakout.cases(run.about["size"])
+    cases = _measured(run, breakout.cases(run.about["size"]))
     names = _present(run, cases)
     head = ["case", *(BY_NAME[name].label for name in names)]
     rows = []
@@ -120,10 +140,28 @@ def _breakout(run: Run) -> str:
             cells.append(f"{cell} ({versus})" if versus and name != breakout.BASELINE else cell)
         rows.append([case.name, *cells])
     note = (
-        "Time of all steps with learning. In parentheses: the ratio to SubprocVecEnv with "
-        f"multiprocessing. {_RATIO}"
+        f"Time of all steps with learning, of which the steps are {_collection(run)}. In "
+        f"parentheses: the ratio to SubprocVecEnv with multiprocessing. {_RATIO}"
     )
     return _text(run, report.table(head, rows), note)
+
+
+def _collection(run: Run) -> str:
+    """Return the least and the greatest share of the steps, of all cases and contenders."""
+    shares = [
+        100 * collection / time
+        for by_contender in run.values.values()
+        for values in by_contender.values()
+        for collection, time in zip(
+            values[breakout.COLLECTION.name], values[breakout.TIME.name], strict=True
+        )
+    ]
+    return f"{min(shares):.0f} % to {max(shares):.0f} %" if shares else "not known"
+
+
+def _measured(run: Run, cases: Sequence[Case]) -> list[Case]:
+    """Return the cases in which a contender took part."""
+    return [case for case in cases if run.values.get(case.name) or run.failures.get(case.name)]
 
 
 def _present(run: Run, cases: Sequence[Case]) -> list[str]:
@@ -197,7 +235,7 @@ def _walker(found: walker.Results) -> str:
     first, last = found.tests[0], max(found.tests, key=lambda test: test.mean)
     rows = [
         ("environment", walker.ENVIRONMENT),
-        ("generations of 48 episodes", f"{found.generations:,}"),
+        (f"generations of {walker.POPULATION} episodes", f"{found.generations:,}"),
         ("steps", f"{found.steps:,}"),
         ("time", f"{found.minutes:.1f} minutes, {found.workers} workers"),
         ("return before training", f"{first.mean:.0f}"),

@@ -153,7 +153,6 @@ def _about(kube: Kube, command: str, size: float) -> dict[str, Any]:
         "kubernetes": server_version(kube),
         "nodes": len(kube.items(path_of("nodes"))),
         "cpu_request": CPU_REQUEST,
-        "idle_timeouts": [IDLE_WORKER, IDLE_POD],
     }
 
 
@@ -163,7 +162,6 @@ def _play(kube: Kube, variables: dict[str, str], allocation: str, plan: Plan) ->
     with _namespace(kube) as scene:
         events = _run(plan, allocation, {**variables, "FIBER_NAMESPACE": scene.namespace})
         scene.wait("the last pod is gone", lambda: not scene.now["pods"], _PATIENCE)
-        after = os.getloadavg()[0]
         begin, wall, opened = results.demand(events)
         changes = [
             (moment.at, moment.name, None if moment.gone else results.held(moment.object))
@@ -178,7 +176,6 @@ def _play(kube: Kube, variables: dict[str, str], allocation: str, plan: Plan) ->
         demand=opened,
         samples=seen,
         load_before=round(before, 2),
-        load_after=round(after, 2),
         in_use=round(in_use, 3),
     )
 

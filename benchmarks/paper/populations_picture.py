@@ -1,4 +1,7 @@
-"""Picture of the runs whose population grows and shrinks: demand as a line over steps of pods."""
+"""Picture of the runs whose population grows and shrinks.
+
+Demand is a line over steps of pods.  Below are the processor-seconds that the pods held until then.
+"""
 
 from __future__ import annotations
 
@@ -21,15 +24,19 @@ _DYNAMIC, _STATIC, _DEMAND, _GPU, _GREY = "#0072B2", "#bbbbbb", "#D55E00", "#009
 
 
 def draw(results: Results, folder: Path) -> None:
-    """Write the picture, with a panel for each run."""
+    """Write the picture, with two panels for each run."""
     names = [name for name in TITLES if name in results.traces]
-    figure, panels = plt.subplots(1, len(names), figsize=(8 * len(names), 5), squeeze=False)
-    for panel, name in zip(panels[0], names, strict=True):
-        _panel(panel, name, results.traces[name])
+    size = (8 * len(names), 7)
+    figure, panels = plt.subplots(
+        2, len(names), figsize=size, squeeze=False, sharex="col", height_ratios=(5, 2)
+    )
+    for pods, sums, name in zip(*panels, names, strict=True):
+        _pods(pods, name, results.traces[name])
+        _sums(sums, results.traces[name])
     figures.finish(figure, folder / PICTURE)
 
 
-def _panel(panel: Any, name: str, both: dict[str, Trace]) -> None:
+def _pods(panel: Any, name: str, both: dict[str, Trace]) -> None:
     dynamic, static = both[DYNAMIC], both[STATIC]
     _fill(panel, static, _STATIC, "pods, static allocation of the peak", 0.45)
     _fill(panel, dynamic, _DYNAMIC, "pods, dynamic pool", 0.55)
@@ -46,10 +53,20 @@ def _panel(panel: Any, name: str, both: dict[str, Trace]) -> None:
     )
     panel.set(
         title=_title(name, dynamic, static),
-        xlabel="seconds since the program's begin",
         ylabel="pods on nodes, open tasks",
         xlim=(0, 1.1 * max(dynamic.wall, static.wall)),
         ylim=(0, None),
+    )
+
+
+def _sums(panel: Any, both: dict[str, Trace]) -> None:
+    """Draw the processor-seconds of both allocations."""
+    for allocation, colour in ((STATIC, _GREY), (DYNAMIC, _DYNAMIC)):
+        at, seconds = zip(*both[allocation].growth, strict=True)
+        label = f"processor-seconds so far, {allocation}"
+        panel.plot(at, seconds, color=colour, linewidth=1.8, label=label)
+    panel.set(
+        xlabel="seconds since the program's begin", ylabel="processor-seconds", ylim=(0, None)
     )
 
 

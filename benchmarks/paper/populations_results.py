@@ -29,7 +29,6 @@ class Held(NamedTuple):
 
     processors: float
     gpus: int
-    running: bool
 
 
 class Sample(NamedTuple):
@@ -37,7 +36,6 @@ class Sample(NamedTuple):
 
     at: float
     pods: int
-    running: int
     gpu_pods: int
     processors: float
     gpus: int
@@ -66,7 +64,6 @@ class Trace:
     demand: list[Open]
     samples: list[Sample]
     load_before: float
-    load_after: float
     in_use: float
     """Share of the processors' time that other programs used in a moment before the run."""
 
@@ -74,6 +71,13 @@ class Trace:
     def processor_seconds(self) -> float:
         """Return what the pods' requests held, in seconds of one processor."""
         return area([(each.at, each.processors) for each in self.samples], self.wall)
+
+    @property
+    def growth(self) -> list[tuple[float, float]]:
+        """Return times, with the processor-seconds that pods held until then."""
+        held_by_pods = [(each.at, each.processors) for each in self.samples]
+        times_of_changes = [each.at for each in self.samples if each.at < self.wall]
+        return [(at, area(held_by_pods, at)) for at in (*times_of_changes, self.wall)]
 
     @property
     def gpu_seconds(self) -> float:
@@ -149,7 +153,6 @@ def held(pod: Body) -> Held | None:
     return Held(
         sum(processors(each.get("requests", {}).get("cpu", "0")) for each in resources),
         sum(int(each.get("limits", {}).get(GPU, 0)) for each in resources),
-        phase == "Running",
     )
 
 
@@ -162,7 +165,7 @@ def processors(quantity: str) -> float:
 def samples(changes: Iterable[tuple[float, str, Held | None]], begin: float) -> list[Sample]:
     """Return the pods over time from their changes, in order: time, name, and what it holds."""
     there: dict[str, Held] = {}
-    found = [Sample(0.0, 0, 0, 0, 0.0, 0)]
+    found = [Sample(0.0, 0, 0, 0.0, 0)]
     for at, name, holds in changes:
         if holds is None:
             there.pop(name, None)
@@ -179,7 +182,6 @@ def _sample(at: float, pods: Iterable[Held]) -> Sample:
     return Sample(
         at,
         len(there),
-        sum(pod.running for pod in there),
         sum(pod.gpus > 0 for pod in there),
         round(sum(pod.processors for pod in there), 6),
         sum(pod.gpus for pod in there),

@@ -30,6 +30,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 from benchmarks.paper import packages, walker_picture
+from benchmarks.session import ROOT
 
 Array = npt.NDArray[np.float64]
 
@@ -244,7 +245,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--minutes", type=minutes_of, default=15.0)
     parser.add_argument("--workers", type=int, default=os.cpu_count())
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--output", type=Path, default=Path("docs/paper"), metavar="FOLDER")
+    parser.add_argument("--output", type=Path, default=ROOT / "docs" / "paper", metavar="FOLDER")
     options = parser.parse_args(arguments)
     if options.workers < 1:
         parser.error(f"--workers must be at least 1, not {options.workers}")

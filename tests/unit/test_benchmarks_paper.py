@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import shutil
 import sys
 import time
 from pathlib import Path
@@ -353,7 +354,20 @@ def test_the_page_has_the_figures_of_the_results() -> None:
     assert texts
     for name in texts:
         assert texts[name] in written
-        assert (page.FOLDER / f"{name}.png").exists()
+        assert name.endswith(page.PODS) or (page.FOLDER / f"{name}.png").exists()
+
+
+def test_runs_with_a_cluster_have_tables_of_their_own(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / page.PODS).mkdir()
+    shutil.copy(page.FOLDER / page.RESULTS, tmp_path / page.PODS)
+    written = tmp_path / "page.md"
+    written.write_text("<!-- evolution_pods: begin -->\n<!-- evolution_pods: end -->\n")
+    monkeypatch.setattr(page, "FOLDER", tmp_path)
+    monkeypatch.setattr(page, "PAGE", written)
+    assert page.write(tmp_path / page.PODS, {}) == written
+    assert "| 32 |" in written.read_text(encoding="utf-8")
 
 
 def test_the_names_of_the_cases_tell_the_kind_of_steps() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import sys
 from pathlib import Path
@@ -97,8 +98,8 @@ def pod(phase: str, node: str | None = "node-1", gpus: str | None = None) -> dic
 
 def test_a_pod_holds_room_from_its_node_to_its_end() -> None:
     assert results.held(pod("Pending", node=None)) is None
-    assert results.held(pod("Pending")) == Held(0.05, 0, running=False)
-    assert results.held(pod("Running", gpus="1")) == Held(0.05, 1, running=True)
+    assert results.held(pod("Pending")) == Held(0.05, 0)
+    assert results.held(pod("Running", gpus="1")) == Held(0.05, 1)
     assert results.held(pod("Succeeded")) is None
     assert results.held(pod("Failed")) is None
 
@@ -111,24 +112,21 @@ def test_a_quantity_of_processors(quantity: str, number: float) -> None:
 
 
 def test_samples_follow_the_pods() -> None:
-    waits, runs = Held(0.05, 0, running=False), Held(0.05, 0, running=True)
-    with_gpu = Held(0.1, 1, running=True)
+    alone, with_gpu = Held(0.05, 0), Held(0.1, 1)
     changes = [
-        (10.5, "a", waits),
-        (11.0, "a", runs),
-        (11.5, "a", runs),  # nothing new
+        (10.5, "a", alone),
+        (11.5, "a", alone),  # nothing new
         (12.0, "b", with_gpu),
         (13.0, "a", None),
         (13.5, "a", None),
         (14.0, "b", None),
     ]
     assert results.samples(changes, 10.0) == [
-        Sample(0.0, 0, 0, 0, 0.0, 0),
-        Sample(0.5, 1, 0, 0, 0.05, 0),
-        Sample(1.0, 1, 1, 0, 0.05, 0),
-        Sample(2.0, 2, 2, 1, 0.15, 1),
-        Sample(3.0, 1, 1, 1, 0.1, 1),
-        Sample(4.0, 0, 0, 0, 0.0, 0),
+        Sample(0.0, 0, 0, 0.0, 0),
+        Sample(0.5, 1, 0, 0.05, 0),
+        Sample(2.0, 2, 1, 0.15, 1),
+        Sample(3.0, 1, 1, 0.1, 1),
+        Sample(4.0, 0, 0, 0.0, 0),
     ]
 
 
@@ -145,11 +143,10 @@ def trace(pods: int, wall: float, gpus: int = 0) -> Trace:
         work=wall,
         demand=[Open(0.0, 2), Open(wall, 0)],
         samples=[
-            Sample(0.0, pods, pods, gpus, pods * 0.05, gpus),
-            Sample(wall + 2, 0, 0, 0, 0.0, 0),
+            Sample(0.0, pods, gpus, pods * 0.05, gpus),
+            Sample(wall + 2, 0, 0, 0.0, 0),
         ],
         load_before=0.5,
-        load_after=1.5,
         in_use=0.25,
     )
 
@@ -160,6 +157,12 @@ def test_pods_count_until_the_end_of_the_program() -> None:
     assert found.gpu_seconds == 10.0
     assert found.most_pods == 4
     assert found.at_work == 0.25
+
+
+def test_processor_seconds_grow_until_the_end_of_the_program() -> None:
+    samples = [Sample(0.0, 0, 0, 0.0, 0), Sample(2.0, 1, 0, 0.5, 0), Sample(9.0, 0, 0, 0.0, 0)]
+    found = dataclasses.replace(trace(1, 6.0), samples=samples)
+    assert found.growth == [(0.0, 0.0), (2.0, 0.0), (6.0, 2.0)]
 
 
 # -- Page
