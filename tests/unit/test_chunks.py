@@ -10,7 +10,6 @@ from fiber._engine.chunks import (
     FLOOR,
     GROWTH,
     LIMIT,
-    LONG,
     PROMPT,
     RESUMED,
     SLOW,
@@ -42,21 +41,15 @@ def test_message_carries_the_target(target: float) -> None:
 def test_slow_tasks_travel_alone_and_do_not_queue() -> None:
     slow = pace(1.0)
     assert slow.batch_size(1000, 4) == 1
-    assert not slow.may_queue(1000, 1)
-    assert pace(LONG / 2).may_queue(1, 4)
-    assert TaskPace().may_queue(1, 4)
-
-
-def test_long_tasks_queue_while_as_many_wait_as_there_are_workers() -> None:
-    long = pace((LONG + SLOW) / 2)
-    assert long.may_queue(4, 4)
-    assert not long.may_queue(3, 4)
+    assert not slow.may_queue(1000)
+    assert pace(SLOW / 2).may_queue(1)
+    assert TaskPace().may_queue(1)
 
 
 def test_less_than_a_message_is_worth_does_not_queue() -> None:
     short = pace(FLOOR / 100)
-    assert not short.may_queue(99, 1)
-    assert short.may_queue(101, 1)
+    assert not short.may_queue(99)
+    assert short.may_queue(101)
 
 
 def test_growth_is_bounded_by_the_measured_time() -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from fiber._engine.chunks import LONG, SLOW
+from fiber._engine.chunks import SLOW
 from fiber._engine.tasks import Limits, WrongAnswer
 from unit.ledger_steps import answer, assign_all, job_of, known, ledger_with, run_to_end
 
@@ -72,13 +72,6 @@ def test_slow_tasks_are_not_queued() -> None:
     ledger, _ = ledger_with(2)
     job_of(ledger, range(10), pace=known(2 * SLOW))
     assert len(assign_all(ledger)) == 2
-
-
-def test_the_last_long_tasks_are_not_queued() -> None:
-    ledger, workers = ledger_with(2)
-    job_of(ledger, range(5), pace=known(LONG))
-    assert len(assign_all(ledger)) == 4, "one for each worker, and one more while two wait"
-    assert [len(worker.queue) for worker in workers] == [2, 2]
 
 
 def test_chunks_stay_whole() -> None:

@@ -26,13 +26,7 @@ RESUMED = 64
 LIMIT = 1 << 12
 """Bound of the tasks in one message, however short they are."""
 
-LONG = 50e-3
-"""Seconds from which on tasks queue only while as many wait as there are workers.
-
-At the end of a job another worker may run them sooner.
-"""
-
-SLOW = 200e-3
+SLOW = 50e-3
 """Seconds from which on tasks do not queue: the gap between two such tasks is negligible."""
 
 SHORTEST = 1e-9
@@ -81,18 +75,13 @@ class TaskPace:
             return 1
         return min(int(target / seconds), GROWTH * self.largest, LIMIT)
 
-    def may_queue(self, waiting: int, workers: int) -> bool:
+    def may_queue(self, waiting: int) -> bool:
         """Return whether to send a message to a worker that is busy already.
 
-        False for slow tasks, and for the last long ones, which another worker may run sooner.
-        False for tasks that take less time than their message: they wait for more tasks, or for
-        an idle worker.
+        False for slow tasks, which another worker may run sooner.  False for tasks that take less
+        time than their message: they wait for more tasks, or for an idle worker.
         """
-        if self.seconds is None:
-            return True
-        if self.seconds >= LONG:
-            return self.seconds < SLOW and waiting >= workers
-        return FLOOR / waiting <= self.seconds
+        return self.seconds is None or FLOOR / waiting <= self.seconds < SLOW
 
     @property
     def short(self) -> bool:

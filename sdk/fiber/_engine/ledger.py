@@ -286,12 +286,10 @@ class Ledger:
         idle = self._load.last_idle()
         if idle is not None:
             return idle
-        waiting = len(job.waiting)
-        workers = len(self.workers) + self.starting
-        if job.waiting.first_alone() or not job.pace.may_queue(waiting, workers):
+        if job.waiting.first_alone() or not job.pace.may_queue(len(job.waiting)):
             return None
         # Tasks that a starting worker can run should not queue behind a batch of another.
-        if self.starting and waiting <= self.starting:
+        if self.starting and len(job.waiting) <= self.starting:
             return None
         return self._load.queueable_after(passed)
 
