@@ -24,7 +24,8 @@ P95 = Metric("p95", "p95", "s")
 NAME = "apply"
 OF_MAIN = "apply, function of __main__"
 BY_VALUE = "apply, function by value"
-NOT_BY_VALUE = dict.fromkeys(("multiprocessing", "concurrent.futures"), "it pickles no lambda")
+NO_LAMBDA = "it pickles no lambda"
+NOT_BY_VALUE = dict.fromkeys(("multiprocessing", "concurrent.futures"), NO_LAMBDA)
 """Contenders that have no functions by value."""
 
 

@@ -151,7 +151,10 @@ def _parse(arguments: Sequence[str]) -> argparse.Namespace:
     every = [*PARTS, _WALKER]
     parser.add_argument("--only", nargs="+", choices=every, default=every, help="default: all")
     parser.add_argument(
-        "--contenders", type=_names, metavar="A,B", help="default: all that a part has"
+        "--contenders",
+        type=_names,
+        metavar="A,B",
+        help="default: all that a part has, but fiber-kubernetes",
     )
     parser.add_argument(
         "--workers", type=_numbers, metavar="N,M", help="default: all numbers that a part has"

@@ -155,6 +155,7 @@ def _collection(run: Run) -> str:
         for collection, time in zip(
             values[breakout.COLLECTION.name], values[breakout.TIME.name], strict=True
         )
+        if collection and time
     ]
     return f"{min(shares):.0f} % to {max(shares):.0f} %" if shares else "not known"
 

@@ -88,11 +88,10 @@ PARTS = {
 
 
 def contenders_of(part: Part, chosen: list[str] | None) -> list[Contender]:
-    """Return the contenders of a part: those chosen, or all, with pods if there is a cluster."""
-    able = [*part.contenders, ON_PODS]
+    """Return the contenders of a part: those chosen, or all but pods."""
     if chosen is None:
-        return able if has_cluster() else able[:-1]
-    return [each for each in able if each.name in chosen]
+        return list(part.contenders)
+    return [each for each in (*part.contenders, ON_PODS) if each.name in chosen]
 
 
 def has_cluster() -> bool:

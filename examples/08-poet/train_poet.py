@@ -98,6 +98,8 @@ def main() -> None:
         parser.error("--iterations and --pairs must be at least 1, --seed at least 0")
     if not options.out.parent.is_dir():
         parser.error(f"--out {options.out}: there is no folder {options.out.parent}")
+    if options.out.suffix not in (".png", ".pdf", ".svg"):
+        parser.error(f"--out {options.out}: the name must end in .png, .pdf or .svg")
     history: list[tuple[dict[int, float], int]] = []
     with fiber.Manager() as manager:
         pairs, sizes = manager.dict(), {"min_workers": 1, "max_workers": options.pairs}

@@ -85,6 +85,8 @@ def main() -> None:
         parser.error("--rounds, --workers, --policies and --episodes must be at least 1")
     if not options.out.parent.is_dir():
         parser.error(f"--out {options.out}: there is no folder {options.out.parent}")
+    if options.out.suffix not in (".png", ".pdf", ".svg"):
+        parser.error(f"--out {options.out}: the name must end in .png, .pdf or .svg")
     found_in, way = phase_1(options)
     if not way:
         sys.exit("The treasure was not found. More --rounds, or another --seed, may find it.")

@@ -56,7 +56,7 @@ def train(learner: Learner, weights: list[Any], unrolls: Any, updates: int) -> A
             weights[unroll.actor].put((learner.version, learner.weights))
             episodes += [(steps, total, lag) for total in unroll.returns]
         if update % max(1, updates // 10) == 0:
-            mean = np.mean([total for _, total, _ in episodes[-50:]])
+            mean = np.mean([total for _, total, _ in episodes[-50:]]) if episodes else np.nan
             print(f"update {update}: {steps:,} steps, mean return {mean:.1f}, lag {lag:.1f}")
     return np.array(episodes)
 
@@ -87,30 +87,35 @@ def main() -> None:
         parser.error("--actors and --updates must be at least 1, --seed at least 0")
     if not options.out.parent.is_dir():
         parser.error(f"--out {options.out}: there is no folder {options.out.parent}")
+    if options.out.suffix not in (".png", ".pdf", ".svg"):
+        parser.error(f"--out {options.out}: the name must end in .png, .pdf or .svg")
     try:
         env: Any = gym.make(options.env)
-    except gym.error.Error as error:
+    except (gym.error.Error, ImportError) as error:
         parser.error(f"--env {options.env}: {error}")
-    shape = env.observation_space.shape or ()
+    shape: tuple[int, ...] = env.observation_space.shape or ()
     if len(shape) != 1 or not isinstance(env.action_space, gym.spaces.Discrete):
         parser.error(f"--env {options.env}: observations must be vectors, and actions Discrete")
     learner = Learner(new_weights(shape[0], int(env.action_space.n), options.seed))
     unrolls: Any = fiber.Queue(2 * options.actors)  # bounded: fast actors wait for the learner
     weights: list[Any] = [fiber.Queue() for _ in range(options.actors)]
     actors = [
-        fiber.Process(target=act, args=(number, options, own, unrolls))
+        fiber.Process(target=act, args=(number, options, own, unrolls), daemon=True)
         for number, own in enumerate(weights)
     ]
     for own, actor in zip(weights, actors, strict=True):
         own.put((0, learner.weights))
         actor.start()
-    draw(options.out, train(learner, weights, unrolls, options.updates))
+    episodes = train(learner, weights, unrolls, options.updates)
     for own in weights:
         own.put(None)
     for actor in actors:
         while unrolls.get() is not None:
             pass  # what actors sent meanwhile
         actor.join()
+    if not len(episodes):
+        sys.exit("No episode has ended, so there is nothing to draw. Take more --updates.")
+    draw(options.out, episodes)
     print(f"picture: {options.out}")
 
 

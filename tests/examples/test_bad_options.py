@@ -15,6 +15,8 @@ from examples.run_example import run
         ("08-poet/train_poet.py", ("--out", "nowhere/a.png"), "there is no folder nowhere"),
         ("09-go-explore/go_explore.py", ("--episodes", 0), "--episodes must be at least 1"),
         ("09-go-explore/go_explore.py", ("--out", "nowhere/a.png"), "there is no folder nowhere"),
+        ("10-impala/impala.py", ("--out", "a.xyz"), "the name must end in .png, .pdf or .svg"),
+        ("10-impala/impala.py", ("--env", "nowhere:A-v0"), "--env nowhere:A-v0: "),
         ("10-impala/impala.py", ("--actors", 0), "--actors and --updates must be at least 1"),
         ("10-impala/impala.py", ("--env", "Chess-v9"), "--env Chess-v9: "),
         (

@@ -24,6 +24,12 @@ def test_actors_feed_the_learner(backend: str, tmp_path: Path) -> None:
     assert len(re.findall(r"^update \d+: .* mean return [\d.]+,", done.stdout, re.M)) == 10
 
 
+def test_a_run_without_an_episode_says_so() -> None:
+    done = run("10-impala/impala.py", "--env", "Acrobot-v1", "--updates", 1, status=1)
+    assert "Take more --updates" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
 @pytest.fixture
 def vtrace(monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.syspath_prepend(str(EXAMPLES / "10-impala"))

@@ -28,7 +28,13 @@ from benchmarks import (  # noqa: E402
     vector,
     workers,
 )
-from benchmarks.contenders import ALL, BY_NAME, ON_PODS, RELAYED  # noqa: E402
+from benchmarks.contenders import (  # noqa: E402
+    ALL,
+    BY_NAME,
+    EXECUTOR_ON_PODS,
+    ON_PODS,
+    RELAYED,
+)
 from benchmarks.model import Run  # noqa: E402
 from benchmarks.suite import MEASURES  # noqa: E402
 
@@ -347,6 +353,7 @@ def runs_on_pods(pods: float) -> dict[str, Run]:
         for contender, value in (
             (ON_PODS.name, pods),
             (RELAYED.name, pods),
+            (EXECUTOR_ON_PODS.name, pods),
             (BASELINE.name, 1.0),
         ):
             sample = {metric.name: value for metric in case.metrics}
