@@ -318,7 +318,7 @@ def _remote() -> Iterator[Budget]:
 
 def _kinds_of_functions(prefix: str, pool: str, executor: str) -> Iterator[Budget]:
     """Return the bounds of calls of other functions, to calls of an importable one."""
-    for kind in (throughput.OF_MAIN, throughput.BY_VALUE):
+    for kind in throughput.OTHER_KINDS:
         what = f"{prefix}latency of one apply, {kind}, p50, to an importable one"
         metric, case = latency.P50.name, f"apply, {kind}"
         ours: Any = {"contender": pool}

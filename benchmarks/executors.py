@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from benchmarks.latency import NO_LAMBDA
 from benchmarks.model import WORKERS, Case, Metric
 from benchmarks.tasks import after
-from benchmarks.throughput import BY_VALUE, OF_MAIN, rate
+from benchmarks.throughput import BY_VALUE, OF_MAIN, OTHER_KINDS, rate
 
 if TYPE_CHECKING:
     from benchmarks.contender import Bench
@@ -27,7 +27,7 @@ the median of up to five batches in a row."""
 RATE = Metric("rate", "tasks a second", "1/s")
 BASELINE = "concurrent.futures"
 SUBMIT = "submit, no-ops"
-SUBMIT_OF = {kind: f"submit, {kind}" for kind in (OF_MAIN, BY_VALUE)}
+SUBMIT_OF = {kind: f"submit, {kind}" for kind in OTHER_KINDS}
 MAP = "map, no-ops"
 IN_CHUNKS = "map, no-ops, chunksize 100"
 SLEEPING = "submit, 1 ms tasks"

@@ -37,13 +37,12 @@ MEASURES: dict[str, ModuleType] = {
 PAGE, PICTURE, RESULTS = "kubernetes.md", "kubernetes.png", "kubernetes.json"
 NOTES = "kubernetes-notes.md"
 """Page that is written by hand."""
-_KINDS = (throughput.OF_MAIN, throughput.BY_VALUE)
 _OF_ONE_HOST = {
     "throughput": (
         "map, chunksize 1",
         "map, default chunks",
         "apply_async",
-        *(f"apply_async, {kind}" for kind in _KINDS),
+        *(f"apply_async, {kind}" for kind in throughput.OTHER_KINDS),
         *throughput.ARRAY_KINDS,
     ),
     "executors": (

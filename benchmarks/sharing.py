@@ -148,16 +148,20 @@ def _pour(queue: Any, go: Any, count: int) -> None:
     go.recv()
 
 
+def _rate(receive: Callable[[], object], count: int) -> dict[str, float]:
+    begin = time.perf_counter()
+    for _ in range(count):
+        receive()
+    return {RATE.name: count / (time.perf_counter() - begin)}
+
+
 def _stream(processes: Any, stack: ExitStack, count: int) -> dict[str, float]:
     queue = processes.Queue()
     go, there = processes.Pipe()
     _start(processes, stack, _pour, queue, there, count)
     go.send(None)
     queue.get()
-    begin = time.perf_counter()
-    for _ in range(count - 1):
-        queue.get()
-    return {RATE.name: (count - 1) / (time.perf_counter() - begin)}
+    return _rate(queue.get, count - 1)
 
 
 def _take_all(queue: Any, done: Any, count: int) -> None:
@@ -193,10 +197,7 @@ def _pipe(processes: Any, stack: ExitStack, count: int) -> dict[str, float]:
     _start(processes, stack, _send_all, there, count)
     here.send(None)
     here.recv()
-    begin = time.perf_counter()
-    for _ in range(count - 1):
-        here.recv()
-    return {RATE.name: (count - 1) / (time.perf_counter() - begin)}
+    return _rate(here.recv, count - 1)
 
 
 def _pour_arrays(queue: Any, go: Any, count: int, nbytes: int) -> None:

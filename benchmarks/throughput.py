@@ -34,6 +34,8 @@ LONG = "one long task"
 MEGABYTE = 1 << 20
 OF_MAIN = "function of __main__"
 BY_VALUE = "function by value"
+OTHER_KINDS = (OF_MAIN, BY_VALUE)
+"""Kinds of functions that are not importable."""
 
 # Name, ability, method, chunk size, tasks.
 _NO_OPS: tuple[tuple[str, str, str, int | None, int], ...] = (
