@@ -9,6 +9,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable
+from contextlib import nullcontext
 from multiprocessing.connection import wait
 from queue import Empty, Full
 from types import SimpleNamespace
@@ -22,8 +23,10 @@ from census import wait_until
 from fiber import queues
 from fiber._hub import local, one_way, queue_delivery
 from fiber._hub.queue_delivery import Feeder, ItemCount
+from fiber._sync.semaphore import Abandoned
 from fiber._wire import packet
 from patience import PATIENCE
+from processes.test_loopback import running
 from unit.interrupting import INSTRUCTIONS, is_interrupted
 
 MORE_THAN_FITS = 10_000
@@ -374,6 +377,25 @@ def test_the_slot_of_a_reader_that_dies_with_its_item_becomes_free() -> None:
     queue.put("kept", timeout=PATIENCE)
     assert queue.get() == "kept"
     assert queue.qsize() == 0
+
+
+def _die_with_the_lock(queue: Any) -> None:
+    queue._slots._claims._lock.acquire()
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+@pytest.mark.parametrize("backend", [nullcontext, running], ids=["local", "loopback"])
+def test_a_process_that_dies_with_the_lock_of_the_slots_causes_no_warning(backend: Any) -> None:
+    with backend():
+        queue: Any = fiber.Queue(1)
+        process = start(_die_with_the_lock, queue)
+        process.join()
+        assert process.exitcode == -signal.SIGKILL
+        lock = queue._slots._claims._lock
+        assert not isinstance(lock.acquire(timeout=PATIENCE), Abandoned)
+        lock.release()
+        queue.put("kept")
+        assert queue.get() == "kept"
 
 
 @pytest.mark.slow

@@ -394,9 +394,10 @@ class HostedSemaphore:
 
     def abandon(self, holder: str) -> None:
         """Note the dead holder for the next acquirer, warn, and return its token."""
-        self._semaphore.note_death(holder)
-        with contextlib.suppress(RuntimeWarning):  # as an error it would end the hub
-            warn_of(holder)
+        if not self._semaphore.is_silent():
+            self._semaphore.note_death(holder)
+            with contextlib.suppress(RuntimeWarning):  # as an error it would end the hub
+                warn_of(holder)
         self.release()
 
     def value(self) -> int:

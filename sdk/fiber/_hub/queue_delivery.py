@@ -402,9 +402,9 @@ class SlotClaims:
     """Table with the number of slots that each process holds.  Any thread may use it."""
 
     def __init__(self) -> None:
-        self.__setstate__(
-            (shared_blocks.create_wait_list(), shared_blocks.create_semaphore(COUNTING, 1, 1))
-        )
+        # Silent: a process that dies with the lock leaves the table consistent.
+        lock = shared_blocks.create_semaphore(COUNTING, 1, 1, silent=True)
+        self.__setstate__((shared_blocks.create_wait_list(), lock))
 
     def __getstate__(self) -> tuple[AnyWaitList, AnySemaphore]:
         return self._table, self._lock

@@ -233,11 +233,17 @@ _semaphores: weakref.WeakValueDictionary[tuple[object, ...], AnySemaphore] = (
 )
 
 
-def create_semaphore(kind: int, value: int, maximum: int) -> SharedSemaphore:
-    """Return a new semaphore with ``value`` of at most ``maximum`` tokens."""
+def create_semaphore(
+    kind: int, value: int, maximum: int, *, silent: bool = False
+) -> SharedSemaphore:
+    """Return a new semaphore with ``value`` of at most ``maximum`` tokens.
+
+    With ``silent`` nobody is told when a process ends with a token: what the token guards is never
+    half changed.
+    """
     block = heap.allocate(SEMAPHORE_SIZE)
     new = _semaphores[block.identity] = SharedSemaphore.create(
-        block, kind, value, maximum, ring_doorbell
+        block, kind, value, maximum, ring_doorbell, silent=silent
     )
     return new
 

@@ -81,7 +81,8 @@ _ATTENTION = 16
 _IS_UNTRACKED = 17
 _TOTAL = 18
 _MAXIMUM = 19
-_DEAD = range(20, 31)  # name of the process whose token was returned last
+_DEAD = range(20, 30)  # name of the process whose token was returned last
+_IS_SILENT = 30  # whether nobody is told of lost tokens
 _SLOTS = range(32, SEMAPHORE_SIZE // 8, 8)
 _NO_SLOT = 31
 """Number in place of a slot when no slot is left."""
@@ -181,15 +182,23 @@ class SharedSemaphore:
 
     @classmethod
     def create(
-        cls, block: SharedBlock, kind: int, value: int, maximum: int, ring: Callable[[], None]
+        cls,
+        block: SharedBlock,
+        kind: int,
+        value: int,
+        maximum: int,
+        ring: Callable[[], None],
+        *,
+        silent: bool = False,
     ) -> SharedSemaphore:
         """Make a semaphore in zeroed memory.
 
-        ``ring`` is called when a token is returned while the hub listens.
+        ``ring`` is called when a token is returned while the hub listens.  With ``silent`` nobody
+        is told when a process ends with a token: what the token guards is never half changed.
         """
         make_semaphore(block.address, value)
         words = block.view.cast("q")
-        words[_TOTAL], words[_MAXIMUM] = value, maximum
+        words[_TOTAL], words[_MAXIMUM], words[_IS_SILENT] = value, maximum, silent
         new = cls(block, kind, ring)
         new._mutex.create()
         return new
@@ -251,6 +260,10 @@ class SharedSemaphore:
     def is_untracked(self) -> bool:
         """Tell whether the holders are unknown, so that tokens of dead processes stay lost."""
         return bool(self._words[_IS_UNTRACKED])
+
+    def is_silent(self) -> bool:
+        """Tell whether nobody is told when a process ends with a token."""
+        return bool(self._words[_IS_SILENT])
 
     def listen(self, listens: bool) -> None:
         """Set whether a release rings the hub's doorbell."""
@@ -398,7 +411,7 @@ class SharedSemaphore:
             lost = words[_TOTAL] - self._get_value()
             lost -= sum(words[slot] == _HELD for slot in self._used() if slot not in gone)
             if gone and lost > 0 and not words[_IS_UNTRACKED]:
-                released = self._names(gone)
+                released = [] if self.is_silent() else self._names(gone)
                 if released:
                     self.note_death(released[-1])
                 # By another SemLock: the one of this object counts the tokens of this process.
