@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from fiber._engine.chunks import LIMIT
 from fiber._engine.ledger import Ledger
-from fiber._engine.tasks import RECALL_AFTER, Batch, Job, Loss, Receipt, WorkerEntry
+from fiber._engine.load import RECALL_AFTER
+from fiber._engine.tasks import Batch, Job, Loss, Receipt, WorkerEntry
 from simulation.oracle import Account, Violation, require
 from simulation.workers import Ref
 

@@ -16,7 +16,7 @@ import pytest
 
 from fiber._agent.interface import ExitReport
 from fiber._agent.last_words import TELL
-from fiber._engine import tasks as entries
+from fiber._engine import load
 from fiber._runtime import exchange, workers
 from fiber._runtime.answers import Pickled, TaskFailure
 from fiber._runtime.executor import PoolExecutor
@@ -151,7 +151,7 @@ def test_idle_workers_get_unread_tasks_of_busy_ones(rig: Rig) -> None:
     for seq, _ in list(rig.children[0].packets):
         rig.answer(idle, seq, [seq])
     assert rig.children[1].recalls == 0
-    rig.loop.pass_time(entries.RECALL_AFTER)
+    rig.loop.pass_time(load.RECALL_AFTER)
     assert rig.children[1].recalls == 1
     unread = rig.children[1].packets[1][0]
     busy.recalled([unread])

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from fiber._engine.chunks import SLOW
-from fiber._engine.tasks import RECALL_AFTER, Limits
+from fiber._engine.load import RECALL_AFTER
+from fiber._engine.tasks import Limits
 from unit.ledger_steps import answer, assign_all, job_of, known, ledger_with, run_to_end
 
 # Taking back

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from fiber._engine.load import RECALL_AFTER
 from fiber._engine.scheduler import IDLE_DEATHS, Decisions, Scheduler
 from fiber._engine.start_failures import FIRST_PAUSE, RAISED_PATIENCE, StartFailure
-from fiber._engine.tasks import RECALL_AFTER, Job, Limits, WorkerEntry
+from fiber._engine.tasks import Job, Limits, WorkerEntry
 from unit.ledger_steps import answer, known
 
 RAISED = StartFailure("pool worker 'w'", "exit status 1", "no such device")

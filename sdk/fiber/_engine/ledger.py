@@ -27,9 +27,11 @@ from operator import attrgetter
 from typing import Any
 
 from fiber._engine.chunks import TaskPace
+from fiber._engine.load import WorkersByLoad
 from fiber._engine.tasks import (
     Batch,
     Job,
+    JobTurns,
     Limits,
     Loss,
     Receipt,
@@ -37,7 +39,6 @@ from fiber._engine.tasks import (
     Span,
     WaitingTasks,
     WorkerEntry,
-    WorkersByLoad,
     WrongAnswer,
 )
 
@@ -61,7 +62,7 @@ class Ledger:
         self.leased = 0  # number of workers that callers lease
         self._open_tasks = 0  # number of tasks of ``jobs`` that are fed and not done
         self._seq = itertools.count(1)
-        self._turns: deque[Job] = deque()
+        self._turns = JobTurns()
         self._with_surplus: set[Job] = set()  # those of ``jobs`` that are paused or have chunks
         self._load = WorkersByLoad()
         self._pins: dict[WorkerEntry, None] = {}
@@ -100,7 +101,7 @@ class Ledger:
             return
         job.waiting.append(Span(job.fed, items, job.alone))
         self._add_fed(job, len(items))
-        self._give_turn(job)
+        self._turns.give(job)
 
     def pin(self, job: Job, worker: WorkerEntry | None, item: Any) -> None:
         """Add a task to ``job`` for this worker alone; for a later worker if it is None or lost."""
@@ -162,7 +163,7 @@ class Ledger:
         if job in self.jobs:
             self._list(job)
         if not paused and job.waiting:
-            self._give_turn(job)
+            self._turns.give(job)
 
     # Workers
 
@@ -466,7 +467,8 @@ class Ledger:
         for batch in sorted(unread, key=_by_seq, reverse=True):
             self._withdraw(batch, now)
             if batch.job is not None:
-                self._requeue(batch.job, batch.rest())
+                batch.job.waiting.put_back(batch.rest())
+                self._turns.give_first(batch.job)
         if len(worker.queue) > 1:
             self._load.sort(worker)
 
@@ -509,10 +511,14 @@ class Ledger:
         return Receipt(job, batch.start, 1, batch)
 
     def recall(self, now: float) -> list[WorkerEntry]:
-        """Return the workers whose unread batch is to be recalled for idle workers."""
+        """Return the workers whose unread batch is to be recalled.
+
+        The batch before it is late, or a worker is idle.
+        """
+        late = self._load.recall_from_late(now)
         if not self._load.idle or any(job.has_next for job in self._turns):
-            return []
-        return self._load.recall(now)
+            return late
+        return late + self._load.recall(now)
 
     def next_recall(self) -> float | None:
         """Return the time of the next recall, if no event comes before; None if there is none."""
@@ -577,12 +583,7 @@ class Ledger:
 
     def _requeue(self, job: Job, span: Span) -> None:
         job.waiting.appendleft(span)
-        self._give_turn(job)
-
-    def _give_turn(self, job: Job) -> None:
-        if not job.listed:
-            job.listed = True
-            self._turns.append(job)
+        self._turns.give(job)
 
     def _drop_if_finished(self, job: Job) -> bool:
         if job.finished:

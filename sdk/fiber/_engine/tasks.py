@@ -1,4 +1,4 @@
-"""Entries of the ledger: jobs, batches, workers, and the sets of workers by load.
+"""Entries of the ledger: jobs, batches and workers.
 
 Only the ledger changes them.  Waiting tasks are slices of a job.  Slices stay whole, so a million
 tasks cost as much as one.
@@ -13,7 +13,6 @@ A lost task runs again.  Two bounds limit that, for two causes of the loss:
 
 from __future__ import annotations
 
-import itertools
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -28,9 +27,6 @@ RunningTask = tuple[int, int]
 
 ENDED_SEQS = 16
 """Number of finished batches that a worker may still answer for."""
-
-RECALL_AFTER = 2e-3
-"""Seconds that a worker may take for a batch before the unread one behind it is recalled."""
 
 
 class Limits(NamedTuple):
@@ -187,6 +183,14 @@ class WaitingTasks:
         self._count += len(span.items)
         self._stocks.appendleft(_Stock(span))
 
+    def put_back(self, span: Span) -> None:
+        """Add tasks that no worker has begun: ahead of all later tasks of the job."""
+        earlier: list[_Stock] = []
+        while self._stocks and self.first() < span.start:
+            earlier.append(self._stocks.popleft())
+        self.appendleft(span)
+        self._stocks.extendleft(reversed(earlier))
+
     def take(self, size: int) -> Span:
         """Take the next tasks: at most ``size``, contiguous, one if it travels alone."""
         stock = self._stocks[0]
@@ -314,13 +318,30 @@ class Job:
         return again, losses
 
 
+class JobTurns(deque[Job]):
+    """Jobs with waiting tasks, in the order in which they get workers."""
+
+    def give(self, job: Job) -> None:
+        """Give the job a turn after all others, unless it has one."""
+        if not job.listed:
+            job.listed = True
+            self.append(job)
+
+    def give_first(self, job: Job) -> None:
+        """Give the job the next turn, since it got no work done in an earlier one."""
+        if job.listed:
+            self.remove(job)
+        job.listed = True
+        self.appendleft(job)
+
+
 class Batch:
     """Slice of a job's tasks in one message.
 
     ``job`` is None once the results do not count.  ``received`` is the number of results; the last
     message of results began at ``_received_from``.  ``stride`` is the number of tasks between two
     notes of the worker's progress.  ``has_function`` is False if the worker must remember the
-    function.
+    function.  ``late`` is True if it ran for too long to let another batch wait behind it.
     """
 
     __slots__ = (
@@ -329,6 +350,7 @@ class Batch:
         "has_function",
         "items",
         "job",
+        "late",
         "pin",
         "received",
         "seq",
@@ -350,6 +372,7 @@ class Batch:
         self.stride = 1 if job is None or job.eager else job.pace.stride()
         self.unit = 1 if job is None else job.unit
         self.received = 0
+        self.late = False
         self._received_from = 0
 
     def take(self, offset: int, count: int, kept: int | None) -> bool:
@@ -382,6 +405,11 @@ class Batch:
     def units(self) -> int:
         """Units that this batch counts for maxtasksperchild."""
         return -(-len(self.items) // self.unit)
+
+    def predicted(self) -> float:
+        """Return the seconds that the batch should take; 0 if that is unknown."""
+        seconds = None if self.job is None else self.job.pace.seconds
+        return 0.0 if seconds is None else seconds * len(self.items)
 
     def rest(self) -> Span:
         """Return the tasks without a result."""
@@ -462,79 +490,3 @@ class Loss(NamedTuple):
     task: int
     counts: LossCounts
     item: Any
-
-
-class WorkersByLoad:
-    """Ready workers in sets, which are dicts in order to keep the order of insertion.
-
-    ``idle``: workers without a batch; ``idle_pinned``: those of them that have pinned tasks.
-    ``queueable``: workers with one batch that may get another.  ``recallable``: workers with two
-    batches, whose second one may be recalled; ``recalled``: those whose second one was recalled.
-    ``spent``: workers that did all units they may do.  Leased and leaving workers get no batches
-    and are neither idle nor queueable.
-    """
-
-    def __init__(self) -> None:
-        self.idle: dict[WorkerEntry, None] = {}
-        self.idle_pinned: dict[WorkerEntry, None] = {}
-        self.queueable: dict[WorkerEntry, None] = {}
-        self.recallable: dict[WorkerEntry, None] = {}
-        self.recalled: dict[WorkerEntry, None] = {}
-        self.spent: dict[WorkerEntry, None] = {}
-
-    def sort(self, worker: WorkerEntry) -> None:
-        """Move ``worker`` to the sets for the work that it has now."""
-        self.idle.pop(worker, None)
-        self.idle_pinned.pop(worker, None)
-        self.queueable.pop(worker, None)
-        queue = worker.queue
-        if len(queue) < 2:
-            self.recallable.pop(worker, None)
-            self.recalled.pop(worker, None)
-        elif worker.recalled:
-            self.recallable.pop(worker, None)
-            self.recalled[worker] = None
-        elif worker not in self.recallable:
-            self.recalled.pop(worker, None)
-            self.recallable[worker] = None
-        if worker.leaving or worker.left == 0:
-            if not queue and not worker.leaving:
-                self.spent[worker] = None
-            return
-        if worker.leased:
-            return
-        if not queue:
-            self.idle[worker] = None
-            self.sort_pinned(worker)
-        elif len(queue) == 1 and not queue[0].alone and not worker.pinned:
-            self.queueable[worker] = None
-
-    def sort_pinned(self, worker: WorkerEntry) -> None:
-        """Update ``idle_pinned`` if only the pinned tasks of ``worker`` have changed."""
-        if worker.pinned and worker in self.idle:
-            self.idle_pinned[worker] = None
-        else:
-            self.idle_pinned.pop(worker, None)
-
-    def last_idle(self) -> WorkerEntry | None:
-        """Return the worker that became idle last: its caches are warm, and others may end."""
-        return next(reversed(self.idle), None)
-
-    def queueable_after(self, spared: int) -> WorkerEntry | None:
-        """Return the queueable worker that will be idle first, after ``spared`` others."""
-        return next(itertools.islice(self.queueable, spared, None), None)
-
-    def recall(self, now: float) -> list[WorkerEntry]:
-        """Return the workers whose unread batch to recall, one for each idle one; mark them."""
-        victims = [worker for worker in self._candidates() if now >= worker.since + RECALL_AFTER]
-        for worker in victims:
-            worker.recalled = True
-            self.sort(worker)
-        return victims
-
-    def next_recall(self) -> float | None:
-        """Return the time of the next recall, if no event comes before; None if there is none."""
-        return min((worker.since + RECALL_AFTER for worker in self._candidates()), default=None)
-
-    def _candidates(self) -> list[WorkerEntry]:
-        return list(itertools.islice(self.recallable, len(self.idle)))
