@@ -443,6 +443,14 @@ def test_tasks_in_one_message_do_not_wait_for_each_other(pool: Pool, tmp_path: P
         gate.unlink()
 
 
+def test_tasks_may_wait_for_tasks_that_were_sent_behind_them(pool: Pool, tmp_path: Path) -> None:
+    awaited = set(tasks.WAITING)
+    stream = itertools.takewhile(lambda _: awaited, itertools.count())
+    for index in pool.imap_unordered(tasks.wait_for_later, ((n, tmp_path) for n in stream)):
+        awaited.discard(index)
+    assert not awaited
+
+
 @pytest.mark.parametrize("chunksize", [None, 1])
 def test_as_many_tasks_as_workers_run_at_once(
     pool: Pool, tmp_path: Path, chunksize: int | None

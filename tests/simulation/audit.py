@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from fiber._engine.chunks import LIMIT
 from fiber._engine.ledger import Ledger
-from fiber._engine.load import RECALL_AFTER
+from fiber._engine.load import CHECK_EVERY, LATE_AFTER, LATE_TIMES, RECALL_AFTER
 from fiber._engine.tasks import Batch, Job, Loss, Receipt, WorkerEntry
 from simulation.oracle import Account, Violation, require
 from simulation.workers import Ref
@@ -52,6 +52,8 @@ class Audit:
         self._ledger = ledger
         self._names = names
         self._watched: dict[WorkerEntry, float] = {}
+        self._late: dict[Batch, float] = {}
+        """When each batch was first seen to be late, with another unread behind it."""
         self._patience: dict[Job, int] = {}
         self._asked: set[WorkerEntry] = set()
         self._left: dict[WorkerEntry, int] = {}
@@ -294,6 +296,7 @@ class Audit:
                 _check_places(job, account, where)
         self._check_demand()
         self._check_idle()
+        self._check_late()
 
     def _check_demand(self) -> None:
         wanted = workers_wanted(self._ledger)
@@ -359,6 +362,19 @@ class Audit:
             raise Violation(
                 f"{self._names.child(late[0]).name} keeps an unread batch from an idle worker"
             )
+
+    def _check_late(self) -> None:
+        """Check that no batch stays unread behind one that takes far longer than predicted."""
+        now = self._world.loop.now()
+        late: dict[Batch, float] = {}
+        for worker in self._ledger.workers - self._asked:
+            if len(worker.queue) == 2:
+                batch = worker.queue[0]
+                if now > worker.since + max(LATE_AFTER, LATE_TIMES * batch.predicted()):
+                    late[batch] = since = self._late.get(batch, now)
+                    name = self._names.child(worker).name
+                    require(now <= since + CHECK_EVERY + SLACK, f"{name} keeps an unread batch")
+        self._late = late
 
     def check_end(self) -> None:
         """Check the ledger once no event is left."""

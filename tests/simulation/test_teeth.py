@@ -128,6 +128,11 @@ class NeverRecalls(Ledger):
         return []
 
 
+class RecallsForTheIdleOnly(Ledger):
+    def recall(self, now: float) -> list[WorkerEntry]:
+        return super().recall(now) if self.idle() else []
+
+
 class ForgetsToRecallLater(Ledger):
     def next_recall(self) -> float | None:
         return None
@@ -194,6 +199,7 @@ BROKEN = [
     DropsWhatIsTakenBack,
     IgnoresWhatIsKept,
     NeverRecalls,
+    RecallsForTheIdleOnly,
     ForgetsToRecallLater,
     ForgetsToCancel,
     IgnoresMaxTasks,

@@ -162,6 +162,24 @@ def test_idle_workers_get_unread_tasks_of_busy_ones(rig: Rig) -> None:
     assert "late" not in results.outcomes.values()
 
 
+def test_the_task_behind_a_late_one_is_the_next_to_be_sent(rig: Rig) -> None:
+    results = rig.map(range(20))
+    late, other = rig.handles
+    assert late.worker is not None
+    assert other.worker is not None
+    unread = late.worker.queue[1]
+    rig.loop.pass_time(load.CHECK_EVERY)
+    assert [child.recalls for child in rig.children] == [1, 1]
+    assert not rig.loop.timers
+    late.recalled([unread.seq])
+    other.recalled([])
+    rig.answer_batch(other.worker.queue[0])
+    assert list(other.worker.queue[1].items) == list(unread.items)
+    assert len(late.worker.queue) == 1
+    rig.answer_all()
+    assert (results.done, len(results.outcomes)) == (1, 20)
+
+
 def test_an_item_that_does_not_pickle_concerns_its_task_alone(rig: Rig) -> None:
     results = rig.map([1, tasks.Unpicklable(), 2])
     rig.answer_all()
