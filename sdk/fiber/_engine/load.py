@@ -1,15 +1,14 @@
 """Workers by load, and the recall of unread batches.
 
-A worker gets its next batch while it runs one, so that short tasks need not wait for a message.
-The price: a batch waits unread, although another worker might run it.  It is recalled in two
+A worker gets its next batch while it runs one, so that a short task need not wait for a message.
+The price: the batch waits unread, although another worker might run it.  It is recalled in two
 cases:
 
-* **A worker is idle,** and no task waits.  The unread batch is worth more there.
-* **The batch before it is late:** it runs several times longer than its pace predicted, and at
-  least ``LATE_AFTER``.  It may run for a minute, or wait for a task of the unread batch.  The worker
-  gets no further batch before it has answered.
-
-The unread tasks of a late worker are the next to be sent.
+* **A worker is idle,** and no task waits.
+* **The batch before it is late.**  It runs several times longer than its pace predicted, and at
+  least ``LATE_AFTER``.  It may run for a minute, or wait for a task of the unread batch.  The
+  worker gets no further batch before it has answered.  The tasks that come back are the next to be
+  sent.
 """
 
 from __future__ import annotations
