@@ -53,7 +53,7 @@ class Audit:
         self._names = names
         self._watched: dict[WorkerEntry, float] = {}
         self._late: dict[Batch, float] = {}
-        """When each batch was first seen to be late, with another unread behind it."""
+        """Times at which late batches were first seen, with another unread behind each."""
         self._patience: dict[Job, int] = {}
         self._asked: set[WorkerEntry] = set()
         self._left: dict[WorkerEntry, int] = {}

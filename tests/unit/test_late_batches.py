@@ -149,7 +149,7 @@ def test_tasks_come_back_in_the_order_of_the_job_whoever_answers_first(
     ledger.recall(PAST)
     for at in order:
         put_back(ledger, late[at])
-    found = []
+    found: list[int] = []
     while len(found) < len(unread):
         answer(ledger, free.queue[0], PAST)
         found += starts(assign_all(ledger, PAST))
