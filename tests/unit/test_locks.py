@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import math
 import os
 import pickle
@@ -42,12 +43,14 @@ def take_turn(semaphore: SharedSemaphore) -> None:
 
 def in_fork(action: Callable[[], object]) -> None:
     """Do it in a process of its own, which ends by that as if it were killed."""
+    gc.disable()  # the fork must not end sockets of nng that other tests have left as garbage
     pid = os.fork()
     if not pid:
         try:
             action()
         finally:
             os._exit(0)
+    gc.enable()
     os.waitpid(pid, 0)
 
 
