@@ -515,7 +515,7 @@ class Ledger:
 
         The batch before it is late, or a worker is idle.
         """
-        late = self._load.recall_from_late(now)
+        late = self._load.recall_from_late(now, alone=len(self.workers) < 2)
         if not self._load.idle or any(job.has_next for job in self._turns):
             return late
         return late + self._load.recall(now)

@@ -97,11 +97,15 @@ class WorkersByLoad:
             [worker for worker in self._candidates() if now >= worker.since + RECALL_AFTER]
         )
 
-    def recall_from_late(self, now: float) -> list[WorkerEntry]:
+    def recall_from_late(self, now: float, *, alone: bool) -> list[WorkerEntry]:
         """Return the workers whose unread batch to recall since another is late; mark them.
 
-        Look for them every ``CHECK_EVERY`` seconds, while there are unread batches.
+        Look for them every ``CHECK_EVERY`` seconds, while there are unread batches.  A worker that
+        is ``alone`` keeps its batch, as nobody else could run it.
         """
+        if alone:
+            self._check_at = None
+            return []
         if self._check_at is not None and now < self._check_at and self.recallable:
             return []
         due, self._check_at = self._check_at, None
