@@ -65,6 +65,13 @@ def test_there_is_no_time_to_look_while_no_batch_is_unread() -> None:
     assert ledger.next_recall() is None
 
 
+def test_nobody_looks_for_late_batches_of_the_only_worker() -> None:
+    ledger, _ = full(1, 100)
+    assert ledger.next_recall() is None
+    assert recall(ledger, PAST) == []
+    assert ledger.next_recall() is None
+
+
 def test_recalled_batches_call_for_no_further_look() -> None:
     ledger, workers = full(2, 100)
     assert set(ledger.recall(PAST)) == set(workers)
