@@ -364,11 +364,15 @@ class Audit:
             )
 
     def _check_late(self) -> None:
-        """Check that no batch stays unread behind one that takes far longer than predicted."""
+        """Check that no batch stays unread behind one that takes far longer than predicted.
+
+        Without another worker it may stay.
+        """
         now = self._world.loop.now()
         late: dict[Batch, float] = {}
-        for worker in self._ledger.workers - self._asked:
-            if len(worker.queue) == 2:
+        workers = self._ledger.workers
+        for worker in workers - self._asked:
+            if len(worker.queue) == 2 and len(workers) > 1:
                 batch = worker.queue[0]
                 if now > worker.since + max(LATE_AFTER, LATE_TIMES * batch.predicted()):
                     late[batch] = since = self._late.get(batch, now)
