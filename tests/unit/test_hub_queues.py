@@ -77,7 +77,7 @@ def test_a_slow_reader_bounds_what_travels(
         up, _ = wires
         frames = up.frames
         assert 0 < remote.qsize() - len(remote._feeder._unsent) == queue.qsize() < 1000
-        assert up.frames - frames < 10
+        assert up.frames - frames < ITEMS // 100  # the channel may still have taken some bundles
         assert [queue.get(timeout=PATIENCE) for _ in range(ITEMS)] == [payload] * ITEMS
 
 
