@@ -43,14 +43,13 @@ def take_turn(semaphore: SharedSemaphore) -> None:
 
 def in_fork(action: Callable[[], object]) -> None:
     """Do it in a process of its own, which ends by that as if it were killed."""
-    gc.disable()  # the fork must not end sockets of nng that other tests have left as garbage
     pid = os.fork()
     if not pid:
+        gc.disable()  # a fork must not end sockets of nng that other tests have left as garbage
         try:
             action()
         finally:
             os._exit(0)
-    gc.enable()
     os.waitpid(pid, 0)
 
 
