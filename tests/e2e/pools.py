@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import json
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -37,7 +38,8 @@ class Pool:
 
     def apply(self, pod_template: Body, **spec: Any) -> Pool:
         """``kubectl apply`` of a manifest."""
-        self.scene.kube.apply(self.manifest(pod_template, **spec))
+        applied = self.scene.kube.apply(self.manifest(pod_template, **spec), "--output=json")
+        self._wait_until_seen(json.loads(applied))
         return self
 
     def manifest(self, pod_template: Body, **spec: Any) -> Body:
@@ -51,10 +53,11 @@ class Pool:
     def scale(self, replicas: int) -> None:
         """``kubectl scale``."""
         self.kubectl("scale", "fiberpool", self.name, f"--replicas={replicas}")
+        self._wait_until_seen(self.scene.kube.call("GET", self._path))
 
     def patch(self, **spec: Any) -> None:
         """``kubectl patch``."""
-        self.scene.kube.patch(self._path, {"spec": spec})
+        self._wait_until_seen(self.scene.kube.patch(self._path, {"spec": spec}))
 
     def attach(self, **spec: Any) -> None:
         """Write the SDK's fields as the SDK does: all of them, by server-side apply."""
@@ -65,7 +68,7 @@ class Pool:
             "spec": spec,
         }
         query = {"fieldManager": names.SDK_MANAGER, "force": "true"}
-        self.scene.kube.patch(self._path, body, APPLY, **query)
+        self._wait_until_seen(self.scene.kube.patch(self._path, body, APPLY, **query))
 
     def delete(self) -> None:
         """``kubectl delete``, without waiting."""
@@ -127,6 +130,18 @@ class Pool:
         return generation is not None and self.status.get("observedGeneration") == generation
 
     # Waiting
+
+    def _wait_until_seen(self, written: Body) -> None:
+        """Wait until the watch shows what was written: until then, all reads are about before."""
+
+        def is_seen() -> bool:
+            seen = self.body.get("metadata", {})
+            made = written["metadata"]
+            if seen.get("uid") != made["uid"]:
+                return False
+            return int(seen["generation"]) >= int(made["generation"])
+
+        self.wait("the watch shows what was written", is_seen)
 
     def wait(self, what: str, condition: Callable[[], Any], seconds: float = 30.0) -> Any:
         return self.scene.wait(f"{self.name}: {what}", condition, seconds)
