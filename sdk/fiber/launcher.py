@@ -563,8 +563,11 @@ def _wait_for_files(launcher: ProgramLauncher, seconds: float) -> bool:
     return True
 
 
-def main() -> int:
-    """Run the program; return the exit status."""
+def main(linger: float = _LINGER) -> int:
+    """Run the program; return the exit status.
+
+    ``linger``: seconds that a reader has to come, to come again, and to take a part of the output.
+    """
     try:
         command = json.loads(os.environ["FIBER_LAUNCHER_COMMAND"])
         folder = os.environ["FIBER_LAUNCHER_FOLDER"]
@@ -573,7 +576,7 @@ def main() -> int:
     except (KeyError, ValueError) as error:
         print(f"fiber.launcher is for the pods of `fiber run`: {error}", file=sys.stderr)
         return FAILED
-    launcher = ProgramLauncher(command, folder, Output())
+    launcher = ProgramLauncher(command, folder, Output(linger=linger))
     _pass_on_signals(launcher)
     try:
         server = _LauncherServer(port, launcher)

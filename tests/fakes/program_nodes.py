@@ -29,17 +29,20 @@ from patience import PATIENCE
 _PIECE = 4096
 _DATA, _ERROR = b"\0", b"\1"
 _AS_PROCESS_1 = """
-import ctypes, runpy
+import ctypes, os, sys
+from fiber import launcher
 PR_SET_CHILD_SUBREAPER = 36
 assert ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1) == 0
-runpy.run_module("fiber.launcher", run_name="__main__")
+status = launcher.main(*map(float, sys.argv[1:]))
+sys.stderr.flush()
+os._exit(status)
 """
 
 
 class Launched:
     """Launcher of one pod."""
 
-    def __init__(self, body: Body, folder: Path) -> None:
+    def __init__(self, body: Body, folder: Path, linger: float | None = None) -> None:
         folder.mkdir()
         self._log = folder / "log"
         container = next(c for c in body["spec"]["containers"] if c["name"] == "program")
@@ -56,7 +59,7 @@ class Launched:
         }
         with self._log.open("wb") as log:
             self.process = subprocess.Popen(
-                [sys.executable, "-c", _AS_PROCESS_1],
+                [sys.executable, "-c", _AS_PROCESS_1, *([] if linger is None else [str(linger)])],
                 env={**os.environ, **given},
                 stdin=subprocess.DEVNULL,
                 stdout=log,
@@ -91,6 +94,8 @@ class ProgramNodes:
         self._folder = folder
         self.auto = True
         """Setting: each pod runs at once."""
+        self.linger: float | None = None
+        """Setting: seconds that a launcher waits for its readers.  None: as many as in a pod."""
         self.cuts: list[int] = []
         """Bytes from a pod after which each of the next port-forwards breaks."""
         self.at_forward: Callable[[], object] = lambda: None
@@ -160,7 +165,7 @@ class ProgramNodes:
 
     def _start(self, name: str) -> None:
         pod = next(p for p in self._store.list("pods") if p["metadata"]["name"] == name)
-        launched = Launched(pod, self._folder / name)
+        launched = Launched(pod, self._folder / name, self.linger)
         self.launched[name] = launched
         self._set(name, "Running", {"running": {}})
         self._set_job(name, {"active": 1, "ready": 1})

@@ -65,6 +65,7 @@ def test_an_api_server_that_starts_and_refuses_everything_does_not_matter(
 
 
 def test_much_output_is_shown_whole(site: Site) -> None:
+    site.nodes.linger = PATIENCE  # a reader that is slower than that loses output
     site.write("train.py", "for n in range(40): print(chr(65 + n) * (1 << 20))")
     outcome = site.fiber("run", "train.py")
     assert outcome.err == ""
