@@ -111,7 +111,7 @@ class Connection(Generic[_Sent_contra, _Received_co]):
         channel.send(*_encoded(obj))
 
     def _send_unconfirmed(self, obj: Any) -> None:
-        """Send without waiting for another host's answer: the next call may raise the error."""
+        """Send without waiting until a large object has arrived at another host."""
         channel = self._channel
         if channel is None or not self._writable:
             raise self._misuse("read-only")

@@ -223,7 +223,10 @@ class JoinableQueue(Queue[_T]):
 
 
 class SimpleQueue(Generic[_T]):
-    """A queue whose ``put`` waits until the item is in the pipe."""
+    """A queue without a thread that sends: ``put`` sends the item itself, and waits for room.
+
+    On another host it waits for room once 64 KiB are on the way.
+    """
 
     def __init__(self, *, ctx: Any = None) -> None:
         inbox, outbox = one_way.pair()

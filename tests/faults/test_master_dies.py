@@ -131,9 +131,10 @@ def test_a_program_killed_while_it_is_stopped_leaves_no_process_to_a_supervisor(
 
 
 AT_A_STAGE = """
-    import fiber, os, signal, threading, time
+    import fiber, os, signal, tempfile, threading, time
     from faults import targets
     if __name__ == "__main__":
+        tempfile.gettempdir()  # the first call has a file in the directory for a moment
         threading.Timer({delay}, os.kill, (os.getpid(), signal.SIGKILL)).start()
         while True:
             fiber.Process(target=targets.block).start()

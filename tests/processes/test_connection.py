@@ -10,6 +10,7 @@ import signal
 import threading
 from array import array
 from collections.abc import Callable
+from contextlib import nullcontext
 from multiprocessing.connection import wait
 from types import SimpleNamespace
 from typing import Any
@@ -27,6 +28,7 @@ from fiber._wire.packet import Message
 from fiber.connection import Connection, Pipe
 from fiber.errors import ConnectionClosed, UnpicklableError
 from patience import PATIENCE
+from processes.test_loopback import running
 
 
 def start(target: Callable[..., Any], *args: Any) -> fiber.Process:
@@ -506,3 +508,26 @@ def test_a_pid_of_another_host_is_not_looked_up_on_this_one(
     """The pid is that of a process here that lives: this one."""
     process = SimpleNamespace(_popen=Elsewhere(os.getpid(), same_pids=same_pids))
     assert connection.how_it_ended(process) == told
+
+
+# A sender's end
+
+
+def _send_and_die(conn: Any, numbers: int) -> None:
+    for number in range(numbers):
+        conn.send(number)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+@pytest.mark.parametrize("backend", [nullcontext, running], ids=["local", "loopback"])
+def test_what_a_killed_process_has_sent_comes_before_its_end(backend: Any) -> None:
+    with backend():
+        for numbers in (1, 50):
+            here, there = Pipe()
+            process = start(_send_and_die, there, numbers)
+            there.close()
+            process.join()
+            assert process.exitcode == -signal.SIGKILL
+            assert [here.recv() for _ in range(numbers) if here.poll()] == list(range(numbers))
+            with pytest.raises(EOFError):
+                here.recv()

@@ -15,14 +15,20 @@ CALLS = ("call", "c_return")
 """Steps at which CPython runs signal handlers: a function begins, or a C function has returned."""
 
 
+def ctrl_c() -> None:
+    """Do what Python does at Ctrl-C."""
+    raise KeyboardInterrupt
+
+
 def is_interrupted(
     action: Callable[[], object],
     stop: int,
     files: set[str] | None = None,
     *,
     steps: tuple[str, ...] = LINES,
+    by: Callable[[], object] = ctrl_c,
 ) -> bool:
-    """Do it, with a KeyboardInterrupt at step ``stop`` of the code in ``files``; False: too short.
+    """Do it, and call ``by`` at step ``stop`` of the code in ``files``; False: too short.
 
     None stands for all files.  Where steps are lines, the locks of ``threading`` count as in any.
     """
@@ -41,7 +47,7 @@ def is_interrupted(
         if event in steps:
             step += 1
             if step == stop:
-                raise KeyboardInterrupt
+                by()
         return trace
 
     before, collects = sys.gettrace(), gc.isenabled()

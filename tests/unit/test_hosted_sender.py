@@ -60,6 +60,9 @@ class Site:
     def answer(self, status: Status, *_: object) -> None:
         self.answers.append(status)
 
+    def refuse(self, error: Exception) -> None:
+        raise error
+
     def send(self) -> None:
         self.sender.send(self, deque([(b"message", ())]))
 

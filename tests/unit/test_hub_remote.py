@@ -18,6 +18,7 @@ from census import wait_until
 from fiber._hub.client import HubStream, ObjectUnreachable
 from fiber._hub.handles import collecting_grants
 from fiber._hub.local import LocalChannel, LocalCounter
+from fiber._hub.pipelined import PipelinedSender
 from fiber._hub.remote import RemoteCounter
 from fiber._hub.streams import WINDOW
 from fiber._transport.channels import wait_readable
@@ -33,8 +34,8 @@ from patience import PATIENCE
 def test_an_unconfirmed_message_keeps_its_place(far_pipe: tuple[Connection, Connection]) -> None:
     here, there = far_pipe
     there.send("first")
-    there._send_unconfirmed("second")
-    there._send_unconfirmed(np.zeros(3 * WINDOW, np.uint8))
+    there.send("second")
+    there.send(np.zeros(3 * WINDOW, np.uint8))
     sender = background(there.send, "last")
     assert [here.recv() for _ in range(2)] == ["first", "second"]
     assert here.recv().nbytes == 3 * WINDOW
@@ -42,34 +43,48 @@ def test_an_unconfirmed_message_keeps_its_place(far_pipe: tuple[Connection, Conn
     sender.join()
 
 
-def test_the_next_send_reports_the_loss_of_an_unconfirmed_message(
+def send_for_ever(there: Connection) -> None:
+    while True:
+        there.send("nobody reads it")
+
+
+def test_a_send_after_the_end_of_the_other_side_fails(
+    far_pipe: tuple[Connection, Connection],
+) -> None:
+    here, there = far_pipe
+    there.send("read")
+    assert here.recv() == "read"
+    here.close()
+    with pytest.raises(BrokenPipeError):
+        send_for_ever(there)
+    with pytest.raises(BrokenPipeError):
+        there.send("nor this")
+
+
+def test_the_first_send_tells_that_nobody_is_there(
     far_pipe: tuple[Connection, Connection],
 ) -> None:
     here, there = far_pipe
     here.close()
-    for _ in range(2):
-        there._send_unconfirmed("nobody reads it")
-        with pytest.raises(BrokenPipeError):
-            there._send_unconfirmed("nor this")
+    with pytest.raises(BrokenPipeError):
+        there.send("nobody reads it")
 
 
-def test_an_interrupted_confirmation_is_not_waited_for_again(
+def test_an_interrupted_send_loses_no_message(
     far_pipe: tuple[Connection, Connection], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupted(*arguments: Any) -> None:
-        reply(*arguments)
+        transmit(*arguments)
         raise KeyboardInterrupt
 
     here, there = far_pipe
-    reply = HubStream._reply
-    there._send_unconfirmed(1)
+    transmit = PipelinedSender._transmit
     with monkeypatch.context() as ctrl_c:
-        ctrl_c.setattr(HubStream, "_reply", interrupted)
+        ctrl_c.setattr(PipelinedSender, "_transmit", interrupted)
         with pytest.raises(KeyboardInterrupt):
-            there._send_unconfirmed(2)
-    there._send_unconfirmed(3)
-    there.send(4)
-    assert [here.recv() for _ in range(3)] == [1, 3, 4]
+            there.send(1)
+    there.send(2)
+    assert [here.recv() for _ in range(2)] == [1, 2]
 
 
 def exchange_on_thread(there: Connection, payload: bytes, results: list[Any]) -> threading.Thread:
@@ -88,8 +103,7 @@ def test_an_exchange_is_one_request(
     far_pipe: tuple[Connection, Connection], wires: tuple[Wire, Wire]
 ) -> None:
     here, there = far_pipe
-    there.send_bytes(b"first")  # from here on the stream is open
-    assert here.recv_bytes() == b"first"
+    assert not there.poll()  # from here on the stream is open
     up, down = wires
     before = up.frames, down.frames
     results: list[Any] = []
@@ -163,7 +177,7 @@ def test_an_exchange_does_not_overtake_an_unconfirmed_message(
     here, there = far_pipe
     assert there._channel is not None
     here.send_bytes(b"answer")
-    there._channel.send_unconfirmed(b"1")
+    there._channel.send(b"1")
     assert there._channel.exchange(b"2").tobytes() == b"answer"
     assert [here.recv_bytes() for _ in range(2)] == [b"1", b"2"]
 
@@ -172,7 +186,7 @@ def test_large_exchanges_keep_their_order(
     far_pipe: tuple[Connection, Connection],
 ) -> None:
     here, there = far_pipe
-    there._send_unconfirmed("before")
+    there.send("before")
     got: list[Any] = []
 
     def exchange() -> None:

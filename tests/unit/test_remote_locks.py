@@ -259,7 +259,7 @@ def test_a_remote_lock_waits_while_its_link_is_cut(here: Any) -> None:
         hosts.close()
 
 
-@pytest.mark.parametrize("operation", [Op.ACQUIRE, Op.POST, Op.TOKENS])
+@pytest.mark.parametrize("operation", [Op.ACQUIRE, Op.RETURN_TOKEN, Op.TOKENS])
 def test_a_stream_for_something_else_is_refused(operation: Op, far: Far) -> None:
     reader, writer = fiber.Pipe(duplex=False)
     there = far(reader)

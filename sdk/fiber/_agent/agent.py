@@ -241,6 +241,8 @@ class Agent:
         unread, running = self._release(child)
         if child.fault is not None:
             reason = f"killed by its agent: {child.fault}"
+        if self._hub is not None:
+            self._hub.read_from_ended()  # what the child has sent comes before its report
         report = ExitReport(
             exitcode, reason, unread, running, host=self.host, cause=cause, stack=stack
         )

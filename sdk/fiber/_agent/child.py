@@ -20,8 +20,10 @@ from fiber._agent import last_words
 from fiber._agent.last_words import ProgressTable
 from fiber._agent.zygote_process import interpreter_arguments
 from fiber._hub import client as hub_client
+from fiber._hub.pipelined import finish_pipes
 from fiber._hub.protocol import HubAddress
 from fiber._transport.channels import UnixChannel
+from fiber._unconfirmed import flush_all
 from fiber._wire.descriptor import Descriptor, contents, own
 from fiber._worker_images import INSTALLED, missing_module
 
@@ -189,7 +191,11 @@ def _run(
         # Up to Python 3.12, ``_bootstrap`` has run multiprocessing's exit functions already.  Those
         # do nothing when they run again here.
         atexit._run_exitfuncs()
-        util._flush_std_streams()  # type: ignore[attr-defined]
+        try:
+            flush_all()
+            finish_pipes()
+        finally:
+            util._flush_std_streams()  # type: ignore[attr-defined]
 
 
 def _load_and_run(

@@ -104,8 +104,8 @@ class RecordSender(logging.Handler):
             if self._channel is None or self._ended:
                 return
             if self._dropped:
-                self._channel.post_within(self._note(), _AT_EXIT)
-            self._channel.sent_within(_AT_EXIT)
+                self._channel.send_within(self._note(), _AT_EXIT)
+            self._channel.all_taken_within(_AT_EXIT)
         except (OSError, EOFError):
             pass  # the program has ended
         finally:
@@ -116,11 +116,11 @@ class RecordSender(logging.Handler):
             self._channel = pickle.loads(self._way)
             self._channel.confirm()
         if self._dropped:
-            if not self._channel.post_within(self._note(), 0):
+            if not self._channel.send_within(self._note(), 0):
                 self._dropped += 1
                 return
             self._dropped = 0
-        if not self._channel.post_within(encode(record), _PATIENCE):
+        if not self._channel.send_within(encode(record), _PATIENCE):
             self._dropped = 1
 
     def _note(self) -> bytes:

@@ -20,11 +20,22 @@ from fiber._hub.local import QuietSocket, without_timeout
 from fiber._hub.protocol import HEAD, ONE, SECRETS, Doorbell, HubAddress, Op, Status
 from fiber._hub.registry import Registry
 from fiber._transport.channels import naming_the_limit, wait_readable
+from fiber._unconfirmed import flush_all, unconfirmed
 from fiber._wire import packet
 from fiber._wire.descriptor import Descriptor
 from fiber._wire.memory_files import BytesLike
 from fiber._wire.packet import Message
 from fiber.errors import ConnectionClosed, FiberError
+
+_WITHOUT_FLUSH = {
+    Op.RECV, Op.GET_ITEM, Op.POLL, Op.CHECK, Op.SYNC, Op.VALUE, Op.CHANGED, Op.TOKENS, Op.SLEEP,
+    Op.WAITERS, Op.HELD, Op.GET, Op.RETURN_TOKEN,
+}  # fmt: skip
+"""Requests that do not wait until earlier messages are confirmed.
+
+They change nothing, or take a message that no sender has to wait for.  The caller of
+``RETURN_TOKEN`` has waited.
+"""
 
 _FORMS = {form.size: form for form in (HEAD, ONE, SECRETS)}
 
@@ -83,6 +94,7 @@ def set_hub_address(address: HubAddress) -> None:
 def set_local_hub(hub: LocalHub | None) -> None:
     """Set the hub of this host, which is in this process.  None: it has ended."""
     global _local_hub
+    flush_all()
     _local_hub = hub
 
 
@@ -130,7 +142,12 @@ def inherited_address() -> HubAddress | None:
     return _address
 
 
-def _refuse_on_loop() -> None:
+def has_local_hub() -> bool:
+    """Tell whether the hub is in this process."""
+    return _local_hub is not None
+
+
+def refuse_on_loop() -> None:
     """Raise RuntimeError on the loop thread, which would wait for itself."""
     if _local_hub is not None and _local_hub.on_loop():
         raise RuntimeError(
@@ -184,8 +201,8 @@ class HubStream:
         """Number of the last request that gets a reply."""
         self._unsettled = False
         """True while a reply is awaited or was given up."""
-        self._begun: int | None = None
-        """Number of the request that ``begin`` sent and ``finish`` has not read."""
+        self.has_acknowledged = False
+        """True once the hub has replied to a request of ``send_request``."""
         self._end = "its hub is gone"
         self._sock, to_its_hub = _dial(home)
         _streams.add(self)
@@ -208,7 +225,9 @@ class HubStream:
         fds: Sequence[int] = (),
     ) -> Reply:
         """Send a request and wait for the reply; its status is NO after ``timeout`` seconds."""
-        _refuse_on_loop()
+        refuse_on_loop()
+        if unconfirmed and operation not in _WITHOUT_FLUSH:
+            flush_all()
         number = self._asked = self._next()
         self._unsettled = True
         try:
@@ -227,21 +246,10 @@ class HubStream:
         """Wait for a further reply to the request of ``ask``."""
         return self._reply(self._asked, None)
 
-    def begin(self, operation: Op, buffers: Sequence[memoryview]) -> None:
-        """Send a request.  ``finish`` reads the reply."""
-        _refuse_on_loop()
-        number = self._next()
-        self._send(HEAD.pack(operation, number), buffers)
-        self._begun = number
-
-    def finish(self) -> Reply | None:
-        """Return the reply to the request of ``begin``; None if there is no request."""
-        number, self._begun = self._begun, None  # after Ctrl-C the reply is not read again
-        return None if number is None else self._reply(number, None)
-
-    def finishes_within(self, seconds: float) -> bool:
-        """Return whether ``finish`` need not wait, ``seconds`` from now at the latest."""
-        return self._begun is None or wait_readable(self._sock.fileno(), seconds)
+    def send_request(self, request: bytes, buffers: Sequence[memoryview] = ()) -> None:
+        """Send a request that the caller has numbered, and whose replies the caller reads."""
+        refuse_on_loop()
+        self._send(request, buffers)
 
     def give_up(self) -> None:
         """Give up the reply to the last request.
@@ -269,10 +277,17 @@ class HubStream:
         """Send a request that has no reply."""
         self._send(form.pack(operation, self._next(), *values))
 
-    def receive(self) -> Reply:
+    def try_receive(self) -> Reply | None:
+        """Receive the next reply, as ``receive`` does, if it is there."""
+        try:
+            return self.receive(wait=False)
+        except BlockingIOError:
+            return None
+
+    def receive(self, *, wait: bool = True) -> Reply:
         """Receive the next reply; ObjectUnreachable with the hub's reason at the end."""
         try:
-            message = packet.receive(self._sock, descriptors=True)
+            message = packet.receive(self._sock, descriptors=True, wait=wait)
         except (EOFError, ConnectionError) as error:
             raise ObjectUnreachable(self._host, self._end) from error
         try:
@@ -286,8 +301,8 @@ class HubStream:
 
     @property
     def has_answered(self) -> bool:
-        """True if the hub replied to the last request."""
-        return self._asked > 0 and not self._unsettled
+        """True if the hub replied to the last request, or to one of ``send_request``."""
+        return self.has_acknowledged or (self._asked > 0 and not self._unsettled)
 
     def fileno(self) -> int:
         """Return the stream's descriptor."""

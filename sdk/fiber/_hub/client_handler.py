@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import hmac
 import struct
+from array import array
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Protocol
 
@@ -18,10 +19,12 @@ from fiber._hub.hosted import (
     Parts,
 )
 from fiber._hub.parties import Party, new_party
+from fiber._hub.pending import PendingRequest, QueuedMessage
 from fiber._hub.protocol import (
     FOUR,
     GRANTING,
     HEAD,
+    NUMBERS,
     ONE,
     SECRET,
     SECRETS,
@@ -68,44 +71,6 @@ class RequestRefused(Exception):
     """Error: a request is refused and the stream ends.  The text says why."""
 
 
-class PendingRequest:
-    """Request that waits for its reply, which is sent once."""
-
-    __slots__ = ("_handler", "_number", "_on_ok", "on_withdrawal", "then")
-
-    def __init__(
-        self, handler: ClientHandler, number: int, on_ok: Callable[[], None] | None = None
-    ) -> None:
-        self._handler = handler
-        self._number = number
-        self._on_ok = on_ok
-        self.on_withdrawal: Callable[[], None] | None = None
-        """Function to call if the request ends without a reply."""
-        self.then: Callable[[], None] | None = None
-        """Second part of the request, which follows a first part that ends with OK."""
-
-    def answer(self, status: Status, value: int = 0, buffers: Sequence[memoryview] = ()) -> None:
-        """Send the reply, or go on with the second part."""
-        then, self.then = self.then, None
-        if then is not None and status is Status.OK:
-            then()
-            return
-        if self._handler.waiting is self:
-            self._handler.waiting = None
-        if self._on_ok is not None and status is Status.OK:
-            self._on_ok()
-        self._handler.stream.send(ONE.pack(status, self._number, value), buffers)
-
-    def report(self) -> None:
-        """Send a reply before the last one: the request was understood."""
-        self._handler.stream.send(ONE.pack(Status.OK, self._number, 0))
-
-    @property
-    def number(self) -> int:
-        """Number of the request on its stream."""
-        return self._number
-
-
 class ClientHandler:
     """Server of one stream; its ``StreamHandler``."""
 
@@ -114,6 +79,7 @@ class ClientHandler:
         self.waiting: PendingRequest | None = None
         self._home = home
         self._admitted = False
+        self._ended = False
         self._attachment: ObjectAttachment | None = None
         self._joined: BlockIdentity | None = None
         self._bound: set[bytes] = set()
@@ -124,6 +90,8 @@ class ClientHandler:
         """Number of the last request that got a token, while the client may still give it up."""
         self._place: int | None = None
         """Place of the client in the wait list of a condition."""
+        self._queued: set[QueuedMessage] = set()
+        """Messages that the channel has not taken."""
         self._party: Party | None = None
         """Part of the client in a barrier."""
         self._claimed = False
@@ -144,6 +112,11 @@ class ClientHandler:
             self._end(str(refusal))
         except (struct.error, ValueError, IndexError, KeyError, OSError) as error:
             # A malformed request, or a system without a free descriptor.
+            self.refuse(error)
+
+    def refuse(self, error: Exception) -> None:
+        """End the stream, whose request failed."""
+        if not self._ended:
             self._end(f"the hub could not carry out the request: {error}")
 
     def on_room(self) -> None:
@@ -178,17 +151,34 @@ class ClientHandler:
         place, self._place = self._place, None
         if place is not None:
             self._wait_list().places.lose(place)
-        attachment, self._attachment = self._attachment, None
-        if attachment is not None:
-            if isinstance(attachment.shared.hosted, HostedChannel):
-                attachment.shared.hosted.forget(self.ready)
-            self._home.registry.detach(attachment)
+        if self._attachment is not None and isinstance(self._hosted, HostedChannel):
+            self._hosted.forget(self.ready)
+            if self._attachment.shared.kind is ObjectKind.CHANNEL:
+                self._drop_messages(self._hosted)
+        self._ended = True
+        self._detach()
         joined, self._joined = self._joined, None
         if joined is not None:
             self._home.replicas.leave(joined, self)
         self._home.registry.take_back(self._bound)
         self._bound.clear()
         self._home.ended(self)
+
+    def _drop_messages(self, channel: HostedChannel) -> None:
+        """Drop the messages for which a pipe has no room: the client was killed.
+
+        To keep them would keep its end of the pipe.  Then a process that sends to the client, and
+        reads nothing, would wait for ever.
+        """
+        for queued in self._queued:
+            channel.withdraw(queued)
+        self._queued.clear()
+
+    def _detach(self) -> None:
+        """Detach the stream from its object, once the channel has taken all messages."""
+        if self._attachment is not None and not self._queued:
+            attachment, self._attachment = self._attachment, None
+            self._home.registry.detach(attachment)
 
     def _cancel(self) -> None:
         """Withdraw the request that waits."""
@@ -310,6 +300,8 @@ class ClientHandler:
     def sync(self, message: Message) -> None:
         """Reply after all earlier replies, so that the client knows that none is on its way.
 
+        The reply has the numbers of the messages that the channel has not taken.
+
         Take back a token whose reply the client has not read.
         """
         if self._holder is not None:
@@ -317,7 +309,9 @@ class ClientHandler:
         elif ONE.unpack(message.payload)[2] == self._last_token_request:
             self._semaphore().release()
         self._last_token_request = None
-        reply = partial(self._request(message).answer, Status.OK)
+        numbers = array(NUMBERS, (queued.number for queued in self._queued)).tobytes()
+        parts = [memoryview(numbers)] if numbers else []
+        reply = partial(self._request(message).answer, Status.OK, buffers=parts)
         reply() if self._party is None else self._party.withdraw(reply)
 
     # A channel
@@ -329,11 +323,22 @@ class ClientHandler:
         return hosted
 
     def send(self, message: Message) -> None:
-        """Send a message."""
+        """Send a message behind the earlier ones, also if the client ends in the meantime."""
         if not message.buffers:
             raise RequestRefused("there is no message to send")
+        channel = self._channel()
         payload, *buffers = message.buffers
-        self._channel().send(self._request(message), deque([(payload, buffers)]))
+        queued = QueuedMessage(self, HEAD.unpack_from(message.payload)[1])
+        self._queued.add(queued)
+        channel.send(queued, deque([(payload, buffers)]))
+        if not queued.was_taken:
+            queued.acknowledge()
+
+    def message_taken(self, queued: QueuedMessage) -> None:
+        """Note that the channel has taken a message, or that no process can read it."""
+        self._queued.discard(queued)
+        if self._ended:
+            self._detach()
 
     def exchange(self, message: Message) -> None:
         """Send a message, then receive one."""
@@ -353,7 +358,7 @@ class ClientHandler:
         counter.add(len(items))
         self._channel().send(request, items)
         if items and self.waiting is request:
-            request.report()
+            request.acknowledge()
             own_count = counter.duplicate()  # the client may end its use of the counter first
             request.on_withdrawal = lambda: own_count.lower(len(items))
 
@@ -472,7 +477,7 @@ class ClientHandler:
             self._semaphore().release()
             self._holder = None
 
-    def post(self, message: Message) -> None:
+    def return_token(self, message: Message) -> None:
         """Return the token of this stream or of another holder."""
         request = self._request(message)
         try:

@@ -21,7 +21,7 @@ from typing import Protocol
 
 from fiber._hub.local import LocalChannel, LocalCounter
 from fiber._hub.one_way import LOOK_AGAIN, ReceivingEnd, SendingEnd
-from fiber._hub.protocol import Doorbell, Status
+from fiber._hub.protocol import HALF_FULL, TAKEN, Doorbell, Status
 from fiber._hub.streams import EDGE, IN, OUT, Poller
 from fiber._sync.semaphore import COUNTING, SLICE, Abandoned, SharedBlock, SharedSemaphore, warn_of
 from fiber._sync.wait_list import WaitList
@@ -36,11 +36,18 @@ Parts = tuple[BytesLike, Sequence[memoryview]]
 class Waiter(Protocol):
     """Request that waits.
 
-    ``PendingRequest`` implements it.  This module stands below ``client_handler``.
+    ``PendingRequest`` implements it.  Its module stands above this one.
     """
 
     def answer(self, status: Status, value: int = 0, buffers: Sequence[memoryview] = ()) -> None:
         """Reply to the request, once."""
+
+
+class WaitingSender(Waiter, Protocol):
+    """Request to send, as ``PendingRequest`` and ``QueuedMessage`` are."""
+
+    def refuse(self, error: Exception) -> None:
+        """End the request's stream instead of a reply."""
 
 
 class HostedChannel:
@@ -49,7 +56,7 @@ class HostedChannel:
     def __init__(self, poller: Poller, channel: LocalChannel) -> None:
         self._poller = poller
         self._channel = channel
-        self._senders: deque[tuple[Waiter, deque[Parts]]] = deque()
+        self._senders: deque[tuple[WaitingSender, deque[Parts]]] = deque()
         self._events = 0
         """Event after which to try again to send; 0 if there is none."""
         self._receivers: deque[Waiter] = deque()
@@ -60,7 +67,7 @@ class HostedChannel:
         """Return the descriptor."""
         return self._channel.fileno()
 
-    def send(self, waiter: Waiter, messages: deque[Parts]) -> None:
+    def send(self, waiter: WaitingSender, messages: deque[Parts]) -> None:
         """Send messages, in the order of the requests.
 
         Messages leave ``messages`` as they are sent.  The reply follows the last one.
@@ -146,10 +153,17 @@ class HostedChannel:
                     messages.popleft()
             except BrokenPipeError:
                 status = Status.BROKEN
+            except OSError as error:  # no descriptor is free, for example
+                self._senders.popleft()
+                waiter.refuse(error)
+                continue
             else:
                 status = Status.OK
             self._senders.popleft()
-            waiter.answer(status, 1)
+            waiter.answer(status, TAKEN | (HALF_FULL if self._is_half_full() else 0))
+
+    def _is_half_full(self) -> bool:
+        return self._channel.is_half_full()
 
     def _try_send(self, payload: BytesLike, buffers: Sequence[memoryview]) -> bool:
         sent = self._channel.try_send(payload, buffers)
@@ -195,6 +209,9 @@ class HostedSender(HostedChannel):
         self._begin: float | None = None
         """Time of the first attempt to send the next message."""
         self._is_timed = False
+
+    def _is_half_full(self) -> bool:
+        return False  # the backlog takes what the socket does not
 
     def close(self) -> None:
         """Stop serving the channel, and close it."""

@@ -12,6 +12,7 @@ import contextlib
 import errno
 import os
 import secrets
+import select
 import socket
 import struct
 import tempfile
@@ -75,6 +76,8 @@ class Hub:
         self._streams: weakref.WeakSet[SocketStream] = weakref.WeakSet()
         # If several threads open it at the same time, the first entry is valid.
         self._opened: list[tuple[HubAddress, socket.socket | None]] = []
+        self._rests_from_accepting = False
+        """True for a moment when no descriptor is free."""
         self._closed = False
 
     @property
@@ -161,6 +164,24 @@ class Hub:
         """Connect ``stream`` to the hub of ``host``."""
         self._router.connect(host, stream)
 
+    def read_from_ended(self) -> None:
+        """Read what processes of this host sent before they ended.
+
+        A stream that waits for credit of another host is read later.
+        """
+        if self._closed:
+            return
+        for _, listener in self._opened[:1]:
+            while listener is not None and self._accept_socket(listener):
+                pass
+        poller = select.poll()
+        streams = {stream.fileno(): stream for stream in self._streams}
+        streams.pop(-1, None)
+        for fd in streams:
+            poller.register(fd, 0)
+        for fd, _ in poller.poll(0):  # an empty mask reports only the end of a stream
+            streams[fd].read_rest()
+
     def ended(self, handler: ClientHandler) -> None:
         """Forget a handler that has ended."""
         self._handlers.discard(handler)
@@ -204,25 +225,30 @@ class Hub:
                 listener.close()
                 remove_directory(os.path.dirname(path))
 
-    def _accept_socket(self, listener: socket.socket) -> None:
+    def _accept_socket(self, listener: socket.socket) -> bool:
+        """Accept a stream; return False if there is none."""
         try:
             sock, _ = listener.accept()
         except BlockingIOError:
-            return
+            return False
         except OSError as error:
             if error.errno not in (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM):
                 raise
             # The client still waits.  Without this pause the loop would spin.
-            self.loop.unregister(listener.fileno())
-            self.loop.call_later(_ACCEPT_AGAIN, self._listen_again, listener)
-            return
+            if not self._rests_from_accepting:
+                self._rests_from_accepting = True
+                self.loop.unregister(listener.fileno())
+                self.loop.call_later(_ACCEPT_AGAIN, self._listen_again, listener)
+            return False
         _, uid, _ = _PEER.unpack(sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size))
         if uid in (os.geteuid(), 0):
             self._admit(sock)
         else:
             sock.close()
+        return True
 
     def _listen_again(self, listener: socket.socket) -> None:
+        self._rests_from_accepting = False
         if listener.fileno() >= 0:
             self.loop.register(listener.fileno(), partial(self._accept_socket, listener))
 

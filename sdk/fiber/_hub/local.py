@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import select
 import socket
+import termios
 import time
+from array import array
 from collections.abc import Sequence
 from functools import partial
 from typing import Any, TypeVar
@@ -17,6 +20,7 @@ from fiber._transport.channels import (
     grow,
 )
 from fiber._transport.loop import LONGEST_POLL
+from fiber._unconfirmed import flush_all, unconfirmed
 from fiber._wire import packet
 from fiber._wire.descriptor import Descriptor
 from fiber._wire.memory_files import BytesLike
@@ -51,6 +55,8 @@ class LocalChannel(UnixChannel):
 
     def try_send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
         """Send one message if there is room for it now."""
+        if unconfirmed:
+            flush_all()
         # O_NONBLOCK would not do: all holders of the socket share it.
         try:
             packet.send(self._sock, payload, buffers, ballast=True, wait=False)
@@ -65,7 +71,13 @@ class LocalChannel(UnixChannel):
             return False
         return True
 
-    def post_within(self, payload: BytesLike, seconds: float) -> bool:
+    def is_half_full(self) -> bool:
+        """Return whether unread messages take half of the room or more."""
+        unread = array("i", [0])
+        fcntl.ioctl(self._sock, termios.TIOCOUTQ, unread)
+        return unread[0] >= self._sock.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF) // 2
+
+    def send_within(self, payload: BytesLike, seconds: float) -> bool:
         """Send one message if there is room for it within ``seconds``."""
         deadline = time.monotonic() + seconds
         while not self.try_send(payload):
@@ -76,7 +88,7 @@ class LocalChannel(UnixChannel):
                 return False
         return True
 
-    def sent_within(self, seconds: float) -> bool:
+    def all_taken_within(self, seconds: float) -> bool:
         """Return True: what was sent can be received."""
         return True
 

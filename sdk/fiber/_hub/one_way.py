@@ -48,6 +48,7 @@ from fiber._transport.channels import (
     wait_readable,
     wait_until,
 )
+from fiber._unconfirmed import flush_all, unconfirmed
 from fiber._wire import packet
 from fiber._wire.descriptor import Descriptor
 from fiber._wire.memory_files import BytesLike
@@ -227,7 +228,7 @@ class SendingEnd(OneWayEnd):
         if bulky:
             wait_until(self.fileno(), select.POLLOUT)
 
-    send_unconfirmed = send
+    send_unconfirmed = send_surely = send
 
     def post(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
         """Send one message.  Wait for room, but not until it is read.
@@ -286,6 +287,8 @@ class SendingEnd(OneWayEnd):
 
         True means that the message is bulky.
         """
+        if unconfirmed:
+            flush_all()
         words = self._words
         if words[HEAD] != words[TAIL]:
             return None
@@ -393,6 +396,8 @@ class ReceivingEnd(OneWayEnd):
         A blocking receive would not do.  The kernel gives the message to a receiver that waits,
         even if it is killed before it runs again.
         """
+        if unconfirmed:  # a sender may wait for the counter
+            flush_all()
         while True:
             claims.add()  # first: after a death there is a record too many, not too few
             try:

@@ -22,7 +22,7 @@ from collections.abc import Callable
 from enum import IntEnum, IntFlag
 from typing import NamedTuple
 
-VERSION = 7
+VERSION = 8
 KEY_BYTES = 32
 
 SECRET_BYTES = 16
@@ -78,6 +78,13 @@ class GrantFlags(IntFlag):
     ENDS_WITH_STREAM = 2  # it ends with the stream on which it was requested
 
 
+NUMBERS = "I"
+"""Code of ``array`` for the numbers of requests."""
+
+TAKEN, HALF_FULL = 1, 2
+"""Flags of a reply to SEND: the channel has the message; the pipe is at least half full."""
+
+
 class Op(IntEnum):
     """Kind of a request."""
 
@@ -93,7 +100,7 @@ class Op(IntEnum):
     RING = 30  # shared memory of this host has changed; silent
     REPLICATE = 31  # an Origin beside it -> offset in the segment whose descriptor is beside it
     # For an attached channel
-    SEND = 10  # payload and buffers beside it
+    SEND = 10  # payload and buffers beside it -> 0 once it is queued, then TAKEN once sent
     RECV = 11  # -> more; payload and buffers beside it
     EXCHANGE = 12  # as SEND, then as RECV; BROKEN if it was not sent
     POLL = 13
@@ -112,7 +119,7 @@ class Op(IntEnum):
     KEEP = 27  # which keeps it; silent
     # For an attached semaphore
     ACQUIRE = 40  # name of the process beside it -> 1 if the stream keeps it; dead holder beside it
-    POST = 41  # NO if the semaphore is at its maximum
+    RETURN_TOKEN = 41  # NO if the semaphore is at its maximum
     TOKENS = 42  # -> number of tokens
     DISOWN = 43  # the stream no longer keeps its token, which stays taken; silent
     # For an attached wait list

@@ -18,6 +18,7 @@ from contextlib import contextmanager, suppress
 from typing import Any, TypeAlias
 
 from fiber._hub.client import HubStream, ObjectUnreachable, Reply
+from fiber._hub.pipelined import LARGE, PipelinedSender
 from fiber._hub.protocol import (
     HEAD,
     NO_SECRET,
@@ -32,6 +33,7 @@ from fiber._hub.protocol import (
     Status,
 )
 from fiber._transport.channels import Claimant, wait_readable
+from fiber._unconfirmed import flush_all
 from fiber._wire import bundle, packet
 from fiber._wire.memory_files import BytesLike
 from fiber._wire.packet import Message
@@ -168,48 +170,63 @@ class RemoteChannel(RemoteObject):
         self._late: deque[Reply] = deque()
         # One stream; more if threads asked for a descriptor at the same moment.
         self._watching: deque[HubStream] = deque()
-        self._unconfirmed: deque[HubStream] = deque()
+        # One; more for a moment if threads sent the first messages at the same time.
+        self._pipelined: list[PipelinedSender] = []
         super().__init__(home, grant, identity)
 
     def send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
-        """Send one message; return when it can be received."""
-        if self._unconfirmed:  # on other streams, which this message must not overtake
-            self.send_unconfirmed(payload, buffers)
-            self._confirm()
-            return
-        with _naming_the_end(), self.stream() as stream:
-            _check_sent(stream.ask(Op.SEND, buffers=[memoryview(payload), *buffers]))
+        """Send one message.  Wait until a large one is in the channel, and for room for small ones.
+
+        BrokenPipeError if an earlier message did not arrive.
+        """
+        self._sender().send(payload, buffers, waits=packet.size_of(payload, buffers) > LARGE)
+
+    def send_surely(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
+        """Send one message; return when the channel has taken it."""
+        self._sender().send(payload, buffers, waits=True)
+
+    post = send
 
     def send_unconfirmed(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
-        """Send one message and return at once.
+        """Send one message as ``send`` does, but do not wait for a large one, either."""
+        self._sender().send(payload, buffers)
 
-        The next call first reads the reply, and raises the error of this message if there was one.
+    def send_within(self, payload: BytesLike, seconds: float) -> bool:
+        """Send one message, if those before arrive within ``seconds``.
+
+        What this process does later may overtake the message.
         """
-        with _naming_the_end(), self._take(self._unconfirmed) as stream:
-            _check_sent(stream.finish())
-            stream.begin(Op.SEND, [memoryview(payload), *buffers])
+        sender = self._sender()
+        if not sender.taken_within(seconds):
+            return False
+        sender.send(payload, tracked=False)
+        return True
 
-    def post_within(self, payload: BytesLike, seconds: float) -> bool:
-        """Send one message, if the message before arrives within ``seconds``."""
-        with _naming_the_end(), self._take(self._unconfirmed) as stream:
-            if not stream.finishes_within(seconds):
-                return False
-            _check_sent(stream.finish())
-            stream.begin(Op.SEND, [memoryview(payload)])
-            return True
+    def all_taken_within(self, seconds: float) -> bool:
+        """Return whether the channel takes all messages within ``seconds``."""
+        return self._sender().taken_within(seconds)
 
-    def sent_within(self, seconds: float) -> bool:
-        """Return whether the last message of ``post_within`` arrives within ``seconds``."""
-        with _naming_the_end(), self._take(self._unconfirmed) as stream:
-            return stream.finishes_within(seconds)
+    def _sender(self) -> PipelinedSender:
+        self._check()
+        if not self._pipelined:
+            with _naming_the_end():
+                stream = self._stream_for_sender()
+                new = PipelinedSender(stream, hub_keeps=isinstance(self, RemoteEnd))
+            self._pipelined.append(new)
+            if self._pipelined[0] is not new:  # another thread was faster
+                new.close()
+        return self._pipelined[0]
 
-    def _confirm(self) -> None:
-        with _naming_the_end(), self._take(self._unconfirmed) as stream:
-            _check_sent(stream.finish())
-
-    def post(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
-        """Send one message as ``send`` does, which only waits until the hub has it."""
-        self.send(payload, buffers)
+    def _stream_for_sender(self) -> HubStream:
+        try:
+            stream = self._idle.pop()
+        except IndexError:
+            self.known()
+            return self._open()
+        late = stream.settle()
+        if late is not None:
+            self._settled(late)
+        return stream
 
     def try_send_directly(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> bool:
         """Return False: to find out whether there is room takes as long as to send."""
@@ -228,8 +245,6 @@ class RemoteChannel(RemoteObject):
 
         BrokenPipeError or ConnectionClosed at the end.  The message may have been sent or not.
         """
-        if self._unconfirmed:  # on other streams, which this message must not overtake
-            self._confirm()
         message = self._receive(Op.EXCHANGE, buffers=[memoryview(payload), *buffers])
         assert message is not None
         return message
@@ -283,7 +298,7 @@ class RemoteChannel(RemoteObject):
         with self.stream() as stream:
             if self._late:
                 if buffers:
-                    _check_sent(stream.ask(Op.SEND, buffers=buffers))
+                    self.send(buffers[0], buffers[1:])
                 reply = self._late.popleft()
             else:
                 reply = stream.ask(operation, *values, form=form, timeout=timeout, buffers=buffers)
@@ -315,9 +330,14 @@ class RemoteChannel(RemoteObject):
 
     def close(self) -> None:
         """Drop this end."""
-        super().close()
-        _close_all(self._watching)
-        _close_all(self._unconfirmed)
+        try:
+            if self._pid == os.getpid() and not self._closed:  # a fork has none of its own
+                flush_all()
+                for sender in self._pipelined:
+                    sender.close()
+        finally:
+            super().close()
+            _close_all(self._watching)
 
     def _watch_again(self) -> None:
         """Make the descriptors not readable, as there is no message, and watch again."""
@@ -331,7 +351,7 @@ class RemoteChannel(RemoteObject):
     def _forked(self) -> None:
         super()._forked()
         self._watching.clear()
-        self._unconfirmed.clear()
+        self._pipelined.clear()
 
     def _settled(self, reply: Reply) -> None:
         if reply.parts:

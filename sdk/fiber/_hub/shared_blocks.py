@@ -47,6 +47,7 @@ from fiber._hub.protocol import (
 from fiber._hub.remote import RemoteCounter, RemoteObject
 from fiber._sync.semaphore import RECURSIVE, SEMAPHORE_SIZE, Abandoned, SharedSemaphore
 from fiber._sync.wait_list import WAIT_LIST_SIZE, WaitList
+from fiber._unconfirmed import flush_all
 from fiber._wire.descriptor import own
 
 # Buffers
@@ -155,6 +156,12 @@ class RemoteSemaphore(RemoteObject):
                 self._depth -= 1
                 return
         self._check()
+        try:
+            flush_all()
+        finally:  # also after an interrupt: the caller does not hold the token any longer
+            self._release()
+
+    def _release(self) -> None:
         if not self._holding:
             with self.stream() as stream:
                 self._give(stream)
@@ -210,7 +217,7 @@ class RemoteSemaphore(RemoteObject):
 
     def _give(self, stream: HubStream) -> None:
         self._depth -= 1  # before another thread can acquire it
-        if stream.ask(Op.POST).status is Status.NO:
+        if stream.ask(Op.RETURN_TOKEN).status is Status.NO:
             self._depth += 1
             raise ValueError("semaphore or lock released too many times")
 

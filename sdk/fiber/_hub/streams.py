@@ -162,6 +162,15 @@ class SocketStream:
                 mask |= IN
             self._poller.watch(self._sock.fileno(), mask, self._event)
 
+    def read_rest(self) -> None:
+        """Read all that the other side, which has ended, has sent."""
+        while self._sock.fileno() >= 0 and not (self._paused or self._finishing):
+            self._read()
+
+    def fileno(self) -> int:
+        """Return the socket's descriptor; -1 after the end."""
+        return self._sock.fileno()
+
     def _event(self, events: int) -> None:
         if events & OUT:
             self._flush()

@@ -365,11 +365,11 @@ def _encoded(thread: ClientThread, number: int, answer: _Answer) -> tuple[bytes,
 
 def _send(channel: Channel, number: int, payload: bytes, buffers: Any) -> None:
     try:
-        channel.send(payload, buffers)
+        channel.send_surely(payload, buffers)
     except BrokenPipeError:
         raise
     except BaseException:  # there is no memory for the answer
-        channel.send(*_failure(number))
+        channel.send_surely(*_failure(number))
 
 
 def _failure(number: int) -> tuple[bytes, Any]:

@@ -72,7 +72,7 @@ class RecordReader:
             deadline = time.monotonic() + _AT_EXIT
             with contextlib.suppress(OSError):
                 # An empty message ends the thread, behind all records.
-                self._outbox.post_within(b"", _AT_EXIT)
+                self._outbox.send_within(b"", _AT_EXIT)
             self._thread.join(max(0.0, deadline - time.monotonic()))
             if self._thread.is_alive():  # a handler is slow or stuck
                 self._inbox.sock.shutdown(socket.SHUT_RDWR)

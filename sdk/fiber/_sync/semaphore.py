@@ -58,6 +58,7 @@ from typing import TYPE_CHECKING, Any, Protocol, Self, cast
 
 from fiber._sync import liveness
 from fiber._sync.liveness import RobustMutex
+from fiber._unconfirmed import flush_all, unconfirmed
 
 RECURSIVE, COUNTING = 0, 1  # SemLock's kinds, in its own numbers
 SEM_VALUE_MAX: int = SemLock.SEM_VALUE_MAX
@@ -226,6 +227,15 @@ class SharedSemaphore:
         AssertionError if it is recursive and this thread has not acquired it.  Without ``wait``,
         the result is False during a revival, and the token is not returned.
         """
+        if not unconfirmed:
+            return self._release(wait)
+        try:
+            flush_all()
+        finally:  # also after an interrupt: the caller does not hold the token any longer
+            is_returned = self._release(wait)
+        return is_returned
+
+    def _release(self, wait: bool) -> bool:
         if self._is_recursive and (not self._is_mine() or self._count() > 1):
             self._give()
             return True

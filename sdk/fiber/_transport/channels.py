@@ -21,6 +21,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol, Self
 
 from fiber._transport.loop import LONGEST_POLL, Loop
+from fiber._unconfirmed import flush_all, unconfirmed
 from fiber._wire import packet
 from fiber._wire.descriptor import Descriptor, own
 from fiber._wire.memory_files import BytesLike
@@ -37,11 +38,11 @@ class Channel(Protocol):
     def send(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
         """Send one message; BrokenPipeError if the other end has no holder left."""
 
-    def send_unconfirmed(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
-        """Send one message without waiting for the answer of another host.
+    def send_surely(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
+        """Send one message.  Return when the channel has taken it, also on another host."""
 
-        An error may be raised by the next call.
-        """
+    def send_unconfirmed(self, payload: BytesLike, buffers: Sequence[memoryview] = ()) -> None:
+        """Send one message.  Do not wait until a large one has arrived at another host."""
 
     def recv(self, *, passing: bool = False) -> Message:
         """Return the next message; ConnectionClosed if the other end has no holder left.
@@ -281,6 +282,8 @@ class UnixChannel:
         """Send one message.  Wait for room; after a bulky message, wait until it is read."""
         global _last_asked
         _last_asked = id(self)
+        if unconfirmed:
+            flush_all()
         try:
             bulky = packet.send(self._sock, payload, buffers, ballast=True, wait=False)
         except BlockingIOError:
@@ -290,7 +293,7 @@ class UnixChannel:
         if bulky:
             wait_until(self._sock.fileno(), select.POLLOUT)
 
-    send_unconfirmed = send
+    send_unconfirmed = send_surely = send
 
     def recv(self, *, passing: bool = False) -> Message:
         """Return the next message; ConnectionClosed at the end."""
@@ -353,8 +356,12 @@ class UnixChannel:
 
     def close(self) -> None:
         """Close this holder's descriptor."""
-        self._sock.detach()
-        self._owner.close()
+        try:
+            if unconfirmed:
+                flush_all()
+        finally:
+            self._sock.detach()
+            self._owner.close()
 
 
 _COUNTER = os.EFD_CLOEXEC | os.EFD_NONBLOCK | os.EFD_SEMAPHORE
@@ -382,7 +389,11 @@ class UnixCounter:
 
     def add(self, n: int = 1) -> None:
         """Raise the count."""
-        os.eventfd_write(self._fd, n)
+        try:
+            if unconfirmed:
+                flush_all()
+        finally:  # also after an interrupt, as callers do not add twice
+            os.eventfd_write(self._fd, n)
 
     def take(self, timeout: float | None) -> bool:
         """Lower the count by one once it is above zero; False when ``timeout`` is over."""
