@@ -222,6 +222,31 @@ def test_to_close_does_not_wait_for_a_send_that_waits(open_pipe: Pipe) -> None:
     assert len(errors) == 1
 
 
+def send_for_ever(there: Connection) -> None:
+    while True:
+        there.send(bytes(30_000))
+
+
+def test_to_close_does_not_wait_for_a_message_that_was_given_up(
+    open_pipe: Pipe, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, there = open_pipe
+    sender = channel_of(there)._pipelined[0]
+    wait = sender._wait
+
+    def wait_or_interrupt(seconds: float) -> None:
+        if is_full(sender):
+            raise KeyboardInterrupt
+        wait(seconds)
+
+    monkeypatch.setattr(sender, "_wait", wait_or_interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        send_for_ever(there)
+    monkeypatch.undo()
+    there.close()
+    assert not sender._untaken
+
+
 def test_a_large_message_has_arrived_when_send_returns(open_pipe: Pipe) -> None:
     here, there = open_pipe
     there.send(bytes(pipelined.LARGE + 1))

@@ -12,9 +12,10 @@ import pytest
 
 import fiber
 from fiber import queues, synchronize
+from fiber._hub.pipelined import PipelinedSender
 from fiber._unconfirmed import unconfirmed
 from fiber.connection import Connection
-from hosts import Far, Hosts
+from hosts import Far, Hosts, Wire
 from patience import PATIENCE
 
 
@@ -163,6 +164,30 @@ def test_an_interrupt_while_others_messages_are_confirmed_stops_no_release(
     unconfirmed.pop((sender, 1), None)
     done = act.__self__
     assert done.is_set() if isinstance(done, synchronize.Event) else done.acquire(False)
+
+
+def test_an_interrupted_close_ends_the_connection(
+    far_pipe: tuple[Connection, Connection],
+    wires: tuple[Wire, Wire],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def interrupted(_: PipelinedSender) -> None:
+        raise KeyboardInterrupt
+
+    here, there = far_pipe
+    there.send("first")
+    up, _ = wires
+    up.hold()
+    there.send("second")
+    monkeypatch.setattr(PipelinedSender, "flush", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        there.close()
+    monkeypatch.undo()
+    up.let_go()
+    assert [here.recv() for _ in range(2)] == ["first", "second"]
+    assert here.poll(PATIENCE)
+    with pytest.raises(EOFError):
+        here.recv()
 
 
 def test_receiving_does_not_wait_for_earlier_messages(

@@ -84,7 +84,7 @@ class PipelinedSender:
         self._unsent: dict[int, int] = {}
         """Messages that are not sent yet, and the threads that send them."""
         self._in_send: dict[int, None] = {}
-        """Messages whose ``send`` has not returned."""
+        """Messages whose ``send`` has not returned, or was interrupted.  None waits for them."""
         self._syncs: dict[int, set[int]] = {}
         """Requests of ``_request_sync``, and the messages that were sent before."""
         self._reading: dict[int, None] = {}
@@ -119,16 +119,14 @@ class PipelinedSender:
         self._check()
         number = self._next_number()
         self._in_send[number] = None
-        try:
-            self._transmit(number, size, payload, buffers, tracked)
-            # Other threads of a program with a hub act without a look at ``unconfirmed``.
-            may_go_on = self._has_delivered and self._has_room and not has_local_hub()
-            if waits or (tracked and not may_go_on):
-                self._wait_until(lambda: number not in self._untaken)
-                self._check()
-                self._has_delivered = True
-        finally:
-            self._in_send.pop(number, None)
+        self._transmit(number, size, payload, buffers, tracked)
+        # Other threads of a program with a hub act without a look at ``unconfirmed``.
+        may_go_on = self._has_delivered and self._has_room and not has_local_hub()
+        if waits or (tracked and not may_go_on):
+            self._wait_until(lambda: number not in self._untaken)
+            self._check()
+            self._has_delivered = True
+        self._in_send.pop(number, None)
 
     def _has_credit(self, size: int) -> bool:
         untaken, me = self._untaken.copy(), get_ident()
@@ -194,8 +192,12 @@ class PipelinedSender:
             if not self._hub_keeps:
                 self.finish()
         finally:
-            self._end("handle is closed")
-            self._stream.close()
+            self.abandon()
+
+    def abandon(self) -> None:
+        """End the stream without a wait.  The hub reads what was sent."""
+        self._end("handle is closed")
+        self._stream.close()
 
     def _check(self) -> None:
         if self._error is not None:
@@ -294,11 +296,13 @@ class PipelinedSender:
     def _note_taken(self, numbers: Iterable[int]) -> None:
         for number in numbers:
             self._untaken.pop(number, None)
+            self._in_send.pop(number, None)
             unconfirmed.pop((self, number), None)
 
     def _end(self, reason: str) -> None:
         self._error = self._error or reason
         self._syncs.clear()
         self._untaken.clear()
+        self._in_send.clear()
         for number in self._unconfirmed():
             unconfirmed.pop((self, number), None)

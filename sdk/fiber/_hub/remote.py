@@ -336,6 +336,9 @@ class RemoteChannel(RemoteObject):
                 for sender in self._pipelined:
                     sender.close()
         finally:
+            if self._pid == os.getpid():
+                for sender in self._pipelined:
+                    sender.abandon()
             super().close()
             _close_all(self._watching)
 
