@@ -141,7 +141,8 @@ class Pool:
                 return False
             return int(seen["generation"]) >= int(made["generation"])
 
-        self.wait("the watch shows what was written", is_seen)
+        # After an outage of the API server the watch first has to connect again.
+        self.wait("the watch shows what was written", is_seen, seconds=60)
 
     def wait(self, what: str, condition: Callable[[], Any], seconds: float = 30.0) -> Any:
         return self.scene.wait(f"{self.name}: {what}", condition, seconds)
