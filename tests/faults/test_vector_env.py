@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import re
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -60,6 +62,20 @@ def test_an_error_of_an_environment_names_its_step_and_worker(vector_env: Make) 
         env.reset(options={"raise": True})
     assert "reset of environment 0" in failed.value.__notes__[0]
     works(env)
+
+
+def test_an_error_of_many_environments_shows_a_few_of_them() -> None:
+    with contextlib.closing(VectorEnv([Faulty] * 6, num_workers=2)) as env:
+        env.reset()
+        with pytest.raises(ArithmeticError) as caught:
+            env.step([Faulty.RAISE] * 6)
+    assert [re.sub(", of.*", "", note) for note in caught.value.__notes__] == [
+        "step of environment 0",
+        "failed, too: step of environment 1",
+        "failed, too: step of environment 2",
+        "failed, too: step of environment 3",
+        "not shown: 2 more errors of environments",
+    ]
 
 
 def test_an_environment_that_raises_is_replaced(vector_env: Make) -> None:

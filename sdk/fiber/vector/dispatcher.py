@@ -1,42 +1,27 @@
-"""Dispatch of commands to environments, their answers, and the replacement of failed workers.
-
-``SubEnvironments`` is the base of both vector environments, Gymnasium's and stable-baselines3's.
-"""
+"""Dispatch of commands to environments, their answers, and the replacement of failed workers."""
 
 from __future__ import annotations
 
-import contextlib
-import os
 import time
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import cache, partial
 from multiprocessing import TimeoutError as WaitedTooLong
 from typing import Any, NamedTuple
 
-from gymnasium.vector import AutoresetMode
-
-import fiber
-from fiber import config, cpu, reduction
+from fiber import reduction
 from fiber._exceptions import add_note, fresh
 from fiber._transport.loop import DOZE
 from fiber.errors import StartError
-from fiber.vector.arrays import (
-    ArrayLayout,
-    ArrayMemory,
-    ObservationMode,
-    Spaces,
-    StepArrays,
-    check_mode,
-)
-from fiber.vector.slot import MakeEnv, Note
+from fiber.vector.arrays import ArrayLayout, ArrayMemory, StepArrays
+from fiber.vector.slot import Note
 from fiber.vector.worker import (
     ATTEMPTS,
     Answer,
     Begin,
     EnvironmentFailure,
     Results,
-    Setup,
     WorkerHello,
 )
 from fiber.vector.worker_process import (
@@ -48,6 +33,9 @@ from fiber.vector.worker_process import (
 )
 
 _STEP = PendingCommand("step")
+
+_SHOWN = 3
+"""Number of other failures that the error of the first one shows."""
 
 
 class Dispatcher:
@@ -69,6 +57,8 @@ class Dispatcher:
         self._failures: list[tuple[int, Exception]] = []
         """Errors to raise, each with the number of an environment."""
         self._begun = False
+        self._next_check = 0.0
+        """Time from which on workers are checked again for one that is stuck."""
 
     # Beginning and end
 
@@ -100,17 +90,15 @@ class Dispatcher:
         """
         self._move_idle_workers()
         commands = []
+        command_of_all = cache(partial(_command_of_all, together))
         for group in self._groups(numbers):
-            if actions is not None:
-                payload: Any = [actions[position] for position in group.positions]
-            elif self._shares(group.worker):
-                payload = None
+            worker, rows = group.worker, group.rows
+            if actions is None and rows is None and self._shares(worker):
+                data = command_of_all(worker.generation)
             else:
-                where = slice(None) if group.rows is None else group.rows
-                payload = (group.worker.arrays.actions.pack(where, shared=False),)
-            pending = dict.fromkeys(group.each(), _STEP)
-            data = _encoded(group.worker, "step", group.rows, payload, together)
-            commands.append((group, pending, data))
+                payload = self._step_payload(group, actions)
+                data = _encoded(worker, "step", rows, payload, together)
+            commands.append((group, dict.fromkeys(group.each(), _STEP), data))
         self._send_commands(commands)
 
     def reset(
@@ -152,7 +140,7 @@ class Dispatcher:
 
     def wait(self, timeout: float | None = None) -> None:
         """Wait until all environments have answered; raise the error of the first that failed."""
-        self._wait(lambda: not any(worker.pending for worker in self._workers), timeout)
+        self._wait(_all_are(self._workers, lambda worker: not worker.pending), timeout)
         self._ready.clear()
 
     def wait_for(self, count: int, timeout: float | None = None) -> list[int]:
@@ -163,7 +151,8 @@ class Dispatcher:
     def results(self, timeout: float | None = None) -> list[Any]:
         """Return the results of ``call``, in its order."""
         calls = self._calls
-        self._wait(lambda: all(group.worker.results is not None for group in calls), timeout)
+        called = [group.worker for group in calls]
+        self._wait(_all_are(called, lambda worker: worker.results is not None), timeout)
         by_position: dict[int, Any] = {}
         for group in calls:
             by_position |= zip(group.positions, group.worker.results or (), strict=True)
@@ -223,6 +212,15 @@ class Dispatcher:
                 raise fresh(group.worker.error)
         return groups
 
+    def _step_payload(self, group: _CommandPart, actions: Any) -> Any:
+        """Return the actions to send; None if the worker has them in the shared arrays."""
+        if actions is not None:
+            return [actions[position] for position in group.positions]
+        if self._shares(group.worker):
+            return None
+        where = slice(None) if group.rows is None else group.rows
+        return (group.worker.arrays.actions.pack(where, shared=False),)
+
     def _send_commands(
         self, commands: Iterable[tuple[_CommandPart, dict[int, PendingCommand], bytes]]
     ) -> None:
@@ -260,11 +258,17 @@ class Dispatcher:
             received = self._workers.receive(left)
             for worker, message in received:
                 self._on_message(worker, message)
-            for each in self._workers:
-                each.kill_if_stuck()
+            self._kill_stuck_workers()
             if not received:  # else a step is in progress, which a move would delay
                 self._move_idle_workers()
         self._raise_failure()
+
+    def _kill_stuck_workers(self) -> None:
+        now = time.monotonic()
+        if now >= self._next_check:
+            self._next_check = now + DOZE
+            for worker in self._workers:
+                worker.kill_if_stuck()
 
     def _on_message(self, worker: WorkerProcess, message: Any) -> None:
         match message:
@@ -327,9 +331,11 @@ class Dispatcher:
     def _raise_failure(self) -> None:
         if self._failures:
             (_, error), *others = sorted(self._failures, key=lambda failure: failure[0])
-            for _, other in others:
+            for _, other in others[:_SHOWN]:
                 for note in getattr(other, "__notes__", ()) or (str(other),):
                     add_note(error, f"failed, too: {note}")
+            if len(others) > _SHOWN:
+                add_note(error, f"not shown: {len(others) - _SHOWN} more errors of environments")
             self._failures.clear()
             raise fresh(error)
 
@@ -429,11 +435,34 @@ def _encoded(
     return reduction.dumps((operation, worker.generation, rows, *rest))
 
 
+def _command_of_all(together: bool, generation: int) -> bytes:
+    """Return the pickled step of all environments of a worker that has the shared arrays."""
+    return reduction.dumps(("step", generation, None, None, together))
+
+
 def _reset_command(
     worker: WorkerProcess, rows: Sequence[int] | None, pending: dict[int, PendingCommand]
 ) -> bytes:
     seeds = [each.seed for each in pending.values()]
     return _encoded(worker, "reset", rows, seeds, [each.options for each in pending.values()])
+
+
+def _all_are(
+    workers: Iterable[WorkerProcess], is_done: Callable[[WorkerProcess], bool]
+) -> Callable[[], bool]:
+    """Return a function that returns whether all workers are done.
+
+    It asks no more about a worker that was done.  So the calls between two answers of hundreds of
+    workers do not ask about each of them.
+    """
+    remaining = list(workers)
+
+    def all_done() -> bool:
+        while remaining and is_done(remaining[-1]):
+            remaining.pop()
+        return not remaining
+
+    return all_done
 
 
 def _only_reports_losses(message: Answer | Results) -> bool:
@@ -454,117 +483,3 @@ class _CommandPart(NamedTuple):
     def each(self) -> Sequence[int]:
         """Return the rows one by one."""
         return range(len(self.worker.numbers)) if self.rows is None else self.rows
-
-
-class SubEnvironments:
-    """Workers with their environments, their spaces, and the arrays of a step."""
-
-    def __init__(
-        self,
-        env_fns: Sequence[MakeEnv],
-        *,
-        owner: str,
-        num_workers: int | None,
-        shared_memory: bool,
-        context: str | None,
-        observation_mode: ObservationMode,
-        autoreset: AutoresetMode,
-        on_error: str,
-        timeout: float | None,
-    ) -> None:
-        self._owner = os.getpid()
-        if not env_fns:
-            raise ValueError("a vector environment has at least one environment: env_fns is empty")
-        if on_error not in ("raise", "restart"):
-            raise ValueError(f"on_error is 'raise' or 'restart', not {on_error!r}")
-        if timeout is not None and timeout <= 0:
-            raise ValueError(f"timeout is a number of seconds above 0, not {timeout!r}")
-        if num_workers is not None and num_workers < 1:
-            raise ValueError(f"num_workers is at least 1, not {num_workers}")
-        check_mode(observation_mode)
-        count = len(env_fns)
-        wanted = cpu.cpu_count() if num_workers is None else num_workers
-        setups = [
-            Setup(index, rows.start, env_fns[rows], autoreset, on_error == "restart", timeout)
-            for index, rows in enumerate(_slices(count, min(wanted, count)))
-        ]
-        chosen = fiber.get_context(context)
-        workers = [WorkerProcess(setup, chosen, owner) for setup in setups]
-        self.dispatcher = Dispatcher(
-            WorkerGroup(workers),
-            restart=on_error == "restart",
-            disruptions=config.current().disruptions,
-        )
-        try:
-            self.dispatcher.start()
-            hellos = [worker.hello for worker in workers if worker.hello is not None]
-            self.metadata = hellos[0].metadata
-            self.render_mode = hellos[0].render_mode
-            self.spaces = Spaces.of(
-                [pair for hello in hellos for pair in hello.spaces],
-                observation_mode,
-                self.dispatcher.name,
-            )
-            shape = ArrayLayout(
-                self.spaces.single_observation_space,
-                self.spaces.single_action_space,
-                count,
-                len(setups),
-            )
-            memory = ArrayMemory.allocate(shape.size()) if shared_memory else None
-            self.arrays = (
-                StepArrays.of_memory(shape, memory.view) if memory else StepArrays.private(shape)
-            )
-            self.dispatcher.begin(shape, self.arrays, memory)
-        except BaseException:
-            self.close(0)
-            raise
-
-    def step(
-        self,
-        numbers: Sequence[int] | None,
-        actions: Any,
-        split: Callable[[Any], list[Any]],
-        *,
-        together: bool,
-    ) -> None:
-        """Begin to step some environments, or all, with a batch of actions for them.
-
-        ``split`` makes a list of the batch.  ``together``: the caller waits for all of them.
-        """
-        count = len(self.arrays.rewards) if numbers is None else len(numbers)
-        columns = self.arrays.actions
-        if columns.fits(actions, count):
-            columns.fill(slice(None) if numbers is None else numbers, actions)
-            self.dispatcher.step(numbers, None, together=together)
-            return
-        chosen = split(actions)
-        if len(chosen) != count:
-            raise ValueError(
-                f"actions for {count} environments are needed, one for each, not {len(chosen)}"
-            )
-        self.dispatcher.step(numbers, chosen, together=together)
-
-    def close(self, timeout: float | None) -> None:
-        """End the workers; kill those that have not ended when ``timeout`` is over."""
-        if os.getpid() == self._owner:  # a forked copy has no workers
-            self.dispatcher.close(timeout)
-
-    def discard(self) -> None:
-        """End the workers at once, from a finalizer."""
-        with contextlib.suppress(RuntimeError):  # Fiber's own thread cannot wait for their ends
-            self.close(0)
-
-    def check_owner(self) -> None:
-        """Raise RuntimeError in another process than the one that made this object."""
-        if os.getpid() != self._owner:
-            raise RuntimeError(
-                f"this vector environment belongs to process {self._owner}: its copy in a forked "
-                "process has no workers. Make one in this process"
-            )
-
-
-def _slices(count: int, parts: int) -> Iterator[slice]:
-    """Yield ``parts`` slices of ``count`` environments, as equal as possible."""
-    for part in range(parts):
-        yield slice(count * part // parts, count * (part + 1) // parts)

@@ -16,8 +16,8 @@ from gymnasium.vector import AutoresetMode
 from stable_baselines3.common import vec_env
 
 from fiber.resources import resources_of, with_resources
-from fiber.vector.dispatcher import SubEnvironments
 from fiber.vector.slot import MakeEnv, Note
+from fiber.vector.sub_environments import SubEnvironments
 
 Indices = int | Sequence[int] | None
 

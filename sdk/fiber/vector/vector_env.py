@@ -23,8 +23,8 @@ from gymnasium.vector.async_vector_env import AsyncState
 from gymnasium.vector.utils import iterate
 
 from fiber.vector.arrays import ObservationMode
-from fiber.vector.dispatcher import SubEnvironments
 from fiber.vector.slot import MakeEnv, Note
+from fiber.vector.sub_environments import SubEnvironments
 
 _Result = TypeVar("_Result")
 
