@@ -19,15 +19,13 @@ import signal
 import sys
 import threading
 import time
-from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator
 from itertools import islice, starmap
 from types import FrameType
 from typing import Any
 
-from fiber._agent import child
+from fiber._agent import child, functions
 from fiber._agent.batch_results import BatchResults, ResultChannel
-from fiber._agent.by_value import FUNCTIONS
 from fiber._agent.exception_pickles import encode_error, format_error
 from fiber._hub.remote import Taken, confirm, loads
 from fiber._wire import work
@@ -39,8 +37,8 @@ SMALL = frozenset({int, float, bool, type(None)})
 
 _Function = Callable[..., Any]
 
-_REPLIED = object()
-"""Marker in place of a function: a reply to the batch was sent already."""
+_OURS = frozenset({__file__, functions.__file__})
+"""Files whose frames are between this loop and the task."""
 
 
 def run(
@@ -88,7 +86,7 @@ class BatchRunner:
         self._channel = channel
         self._progress = progress
         self._retryable = retryable
-        self._functions: OrderedDict[int, _Function] = OrderedDict()
+        self._functions = functions.KnownFunctions()
         self._watchdog = Watchdog()
         self._interruptible = False
 
@@ -128,8 +126,7 @@ class BatchRunner:
             taken: Taken = []
             function: Any = _Caller(buffers, taken)
         else:
-            function = self._function(seq, head, body, buffers)
-            if function is _REPLIED:
+            if not self._knows_function(seq, head, body, buffers):
                 return
             pickled = body if head.size == work.BESIDE else body[head.size :]
             try:
@@ -138,6 +135,15 @@ class BatchRunner:
                 self._reply(work.UNREADABLE, seq, encode_error(error))
                 return
             buffers.clear()
+            eager = not head.stride
+            loading = time.perf_counter()
+            try:
+                function = self._functions.get(head.function, head.unit, eager=eager)
+            except BaseException as error:
+                self._reply(work.BROKEN, seq, encode_error(error))
+                return
+            # A function that takes long to unpickle must not pass for slow tasks.
+            started += time.perf_counter() - loading
         batch = self._start(seq, items, started, taken, eager=not head.stride)
         del items  # the iterator frees the items at its end
         self._note(seq)
@@ -199,29 +205,22 @@ class BatchRunner:
         progress[1] = 0
         progress[0] = seq
 
-    def _function(
+    def _knows_function(
         self, seq: int, head: work.Head, body: memoryview, buffers: list[memoryview]
-    ) -> Any:
-        """Return the function of a batch, or _REPLIED.
-
-        The function may be any object.  If it cannot be called, the first task fails.
-        """
-        functions = self._functions
-        if head.size:
-            inline = None if head.size == work.BESIDE else body[: head.size]
-            data, beside = work.take_beside(inline, buffers[: head.buffers])
-            try:
-                function = pickle.loads(data, buffers=beside)
-            except BaseException as error:
-                self._reply(work.BROKEN, seq, encode_error(error))
-                return _REPLIED
-            functions[head.function] = function
-            if len(functions) > FUNCTIONS:
-                functions.popitem(last=False)
-        elif head.function not in functions:
-            self._reply(work.UNKNOWN, seq)
-            return _REPLIED
-        return functions[head.function]
+    ) -> bool:
+        """Return whether the function of a batch is known now; if not, reply so."""
+        if not head.size:
+            if head.function not in self._functions:
+                self._reply(work.UNKNOWN, seq)
+                return False
+            return True
+        inline = None if head.size == work.BESIDE else body[: head.size]
+        try:
+            self._functions.learn(head.function, *work.take_beside(inline, buffers[: head.buffers]))
+        except BaseException as error:
+            self._reply(work.BROKEN, seq, encode_error(error))
+            return False
+        return True
 
     def _reply(self, *words: Any) -> None:
         self._channel.send(pickle.dumps(words))
@@ -373,7 +372,7 @@ def _report_exit(error: SystemExit) -> None:
 
 
 def _is_ours(frame: FrameType) -> bool:
-    return frame.f_code.co_filename == __file__
+    return frame.f_code.co_filename in _OURS
 
 
 def _spread(function: _Function) -> _Function:
