@@ -263,6 +263,17 @@ def start_slowly(gate: Path) -> None:
 # Objects that do not travel well
 
 
+class Log:
+    """List of items that a method adds to."""
+
+    def __init__(self) -> None:
+        self.items: list[int] = []
+
+    def add(self, item: int) -> int:
+        self.items.append(item)
+        return len(self.items)
+
+
 class Unpicklable:
     def __reduce__(self) -> NoReturn:
         raise RuntimeError("cannot be pickled")

@@ -48,6 +48,16 @@ def test_map(pool: Pool, kind: Any, chunksize: int | None) -> None:
     assert pool.map(tasks.square, source, chunksize) == [x * x for x in range(50)]
 
 
+def test_each_chunk_has_its_own_copy_of_the_object_of_a_method(pool: Pool) -> None:
+    for _ in range(2):
+        log = tasks.Log()
+        assert pool.map(log.add, range(6), 1) == [1] * 6
+        assert pool.map(log.add, range(6), 3) == [1, 2, 3] * 2
+        assert sorted(pool.imap_unordered(log.add, range(6), 2)) == [1, 1, 1, 2, 2, 2]
+        assert pool.apply(log.add, (0,)) == 1
+    assert log.items == []
+
+
 @pytest.mark.parametrize("chunksize", [None, 1, 7])
 def test_starmap_unpacks_the_arguments_of_each_call(pool: Pool, chunksize: int | None) -> None:
     pairs = list(zip(range(30), range(30, 0, -1), strict=True))

@@ -4,14 +4,19 @@ multiprocessing unpickles the function for each chunk.  So what a task changes i
 bound method, or in an argument of a partial, is gone when its chunk ends.  A worker does the same
 with such functions.  It unpickles others once: plain functions, classes, and partials of them
 whose arguments cannot change.
+
+Queues, locks, proxies and the like stand for something that all processes share.  A copy of them
+would be the same, and a worker takes long to attach to one.  So all copies have the same ones.
 """
 
 from __future__ import annotations
 
+import contextlib
+import io
 import pickle
 from collections import OrderedDict
-from collections.abc import Callable, Iterable
-from functools import partial
+from collections.abc import Callable, Hashable, Iterable
+from functools import cache, partial
 from types import (
     BuiltinFunctionType,
     FunctionType,
@@ -20,7 +25,7 @@ from types import (
     ModuleType,
     WrapperDescriptorType,
 )
-from typing import Any
+from typing import Any, cast
 
 from fiber._agent.by_value import FUNCTIONS
 from fiber._wire.memory_files import BytesLike
@@ -31,6 +36,9 @@ LARGE = 1 << 14
 """Bytes of a pickled function above which the tasks that travel together share one copy."""
 
 _DEFINITIONS = (FunctionType, MethodDescriptorType, WrapperDescriptorType, type)
+
+_SHARING = ("fiber", "multiprocessing.managers")
+"""Modules, or packages, of the classes whose objects stand for something shared."""
 
 _CONSTANTS = frozenset({bool, bytes, complex, float, int, range, str, type(None), type(...)})
 
@@ -74,12 +82,19 @@ class _Copies:
     def __init__(self, data: bytes, buffers: list[memoryview]) -> None:
         self._data = data
         self._buffers = buffers
+        self._shared: list[Any] = []
+        """Objects that all copies have in common."""
         self._spare: list[Function] = []
         """Copy that no task has had yet; empty if there is none."""
         self.size = len(data) + sum(buffer.nbytes for buffer in buffers)
 
     def with_spare(self, function: Function) -> _Copies:
-        """Keep a copy for the first task."""
+        """Keep a copy for the first task, and what later ones have in common with it."""
+        if any(name.encode() in self._data for name in _SHARING):
+            # An object that pickles only in the program has its own queues and locks in each copy.
+            with contextlib.suppress(Exception):
+                self._data, self._shared = _pickled_beside_shared(function)
+                self._buffers = []
         self._spare.append(function)
         return self
 
@@ -89,8 +104,43 @@ class _Copies:
 
     def unpickle(self) -> Function:
         """Return a new copy.  It shares no memory that a task can change with another one."""
-        function: Function = pickle.loads(self._data, buffers=map(_own, self._buffers))
+        buffers = map(_own, self._buffers)
+        function: Function = _Unpickler(self._data, buffers, self._shared).load()
         return function
+
+
+class _Pickler(pickle.Pickler):
+    """Pickler that leaves shared objects and definitions out, and keeps them in a list."""
+
+    def __init__(self, file: io.BytesIO) -> None:
+        super().__init__(file, protocol=5)
+        self.shared: list[Any] = []
+
+    def persistent_id(self, obj: Any) -> int | None:
+        """Return the number of an object to leave out; None for another one."""
+        if not isinstance(obj, _DEFINITIONS) and not _is_shared(obj):
+            return None
+        self.shared.append(obj)
+        return len(self.shared) - 1
+
+
+class _Unpickler(pickle.Unpickler):
+    """Unpickler of what ``_Pickler`` has written, or another pickler."""
+
+    def __init__(self, data: bytes, buffers: Iterable[Any], shared: list[Any]) -> None:
+        super().__init__(io.BytesIO(data), buffers=buffers)
+        self._shared = shared
+
+    def persistent_load(self, pid: Any) -> Any:
+        """Return the object that the pickler left out."""
+        return self._shared[pid]
+
+
+def _pickled_beside_shared(function: Function) -> tuple[bytes, list[Any]]:
+    file = io.BytesIO()
+    pickler = _Pickler(file)
+    pickler.dump(function)
+    return file.getvalue(), pickler.shared
 
 
 class _FreshForEachChunk:
@@ -116,7 +166,7 @@ def _own(buffer: memoryview) -> memoryview | bytearray:
 def _is_constant(value: Any) -> bool:
     """Return whether nothing in ``value`` can be changed, except what its module holds."""
     kind = type(value)
-    if kind in _CONSTANTS or isinstance(value, _DEFINITIONS):
+    if kind in _CONSTANTS or isinstance(value, _DEFINITIONS) or _is_shared(value):
         return True
     if kind is BuiltinFunctionType or kind is MethodType:
         return value.__self__ is None or isinstance(value.__self__, type | ModuleType)
@@ -129,3 +179,18 @@ def _is_constant(value: Any) -> bool:
 
 def _are_constant(values: Iterable[Any]) -> bool:
     return all(map(_is_constant, values))
+
+
+def _is_shared(value: Any) -> bool:
+    """Return whether ``value`` stands for something that all processes share."""
+    if hasattr(type(value), "_b_base_"):  # an object of ctypes, perhaps in shared memory
+        return hasattr(value, "_wrapper")
+    return _stands_for_shared(cast("Hashable", type(value)))  # mypy doubts it
+
+
+@cache
+def _stands_for_shared(kind: Any) -> bool:
+    modules = {base.__module__ for base in kind.__mro__}
+    return any(
+        module == name or module.startswith(f"{name}.") for module in modules for name in _SHARING
+    )
