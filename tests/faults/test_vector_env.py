@@ -91,7 +91,7 @@ def test_an_environment_that_raises_is_replaced(vector_env: Make) -> None:
     assert truncations.tolist() == [False, False, True, False]
     assert not terminations.any()
     assert infos["_restarted"].tolist() == truncations.tolist()
-    assert infos["restarted"][2] == "step raised ArithmeticError: a bad action"
+    assert infos["restarted"][2].startswith("step raised ArithmeticError: a bad action (")
     observations, _, _, truncations, infos = env.step([GOOD] * 4)
     assert observations.tolist() == [[3], [3], [0], [3]]  # reset, as after any episode
     assert not truncations.any()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from typing import Any
@@ -258,3 +259,10 @@ def asleep(thread: threading.Thread) -> bool:
     """Return whether the kernel has put the thread to sleep."""
     with open(f"/proc/self/task/{thread.native_id}/stat") as file:
         return file.read().rpartition(") ")[2].startswith("S")
+
+
+def test_a_wait_while_the_interpreter_ends_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    # The thread that would set the latch does not run any more then.
+    monkeypatch.setattr(sys, "is_finalizing", lambda: True)
+    with pytest.raises(RuntimeError, match="the interpreter is ending"):
+        Latch().wait()

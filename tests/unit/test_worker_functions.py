@@ -86,7 +86,7 @@ def test_the_tasks_of_a_message_share_the_copy_of_a_large_function() -> None:
         Counter.make,
         math.sqrt,
         str.upper,
-        partial(log, ()),
+        partial(math.pow, 2.0),
         partial(partial(operator.add, 1), y=("a", 2, None)),
     ],
     ids=str,

@@ -202,7 +202,14 @@ class Latch:
 
 
 def check_may_wait() -> None:
-    """Raise RuntimeError on a loop thread, which would wait for itself."""
+    """Raise RuntimeError where a wait would never end.
+
+    A loop thread would wait for itself.  While the interpreter ends, the loop thread is stopped.
+    """
+    if sys.is_finalizing():
+        raise RuntimeError(
+            "the interpreter is ending, and Fiber's own thread does not run any more"
+        )
     if loop.runs_here():
         raise RuntimeError(
             "a finalizer cannot wait for a result here: the garbage collector runs it on Fiber's "

@@ -364,6 +364,8 @@ class StepArrays:
         self, row: int, observation: Any, reward: Any, terminated: bool, truncated: bool
     ) -> None:
         """Store the results of a step of one environment."""
+        if reward is None:  # NumPy would store it as NaN
+            raise TypeError("a reward is a number, not None")
         self.observations.put(row, observation)
         self.rewards[row] = reward
         self.terminations[row] = terminated

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import time
 import warnings
 from collections import deque
@@ -14,6 +16,7 @@ from fiber import reduction
 from fiber._exceptions import add_note, fresh
 from fiber._transport.loop import DOZE
 from fiber.errors import StartError
+from fiber.process import Process
 from fiber.vector.arrays import ArrayLayout, ArrayMemory, StepArrays
 from fiber.vector.slot import Note
 from fiber.vector.worker import (
@@ -33,6 +36,8 @@ from fiber.vector.worker_process import (
 )
 
 _STEP = PendingCommand("step")
+
+_PACKAGE = os.path.dirname(__file__)
 
 _SHOWN = 3
 """Number of other failures that the error of the first one shows."""
@@ -56,6 +61,9 @@ class Dispatcher:
         self._notes: dict[int, Note] = {}
         self._failures: list[tuple[int, Exception]] = []
         """Errors to raise, each with the number of an environment."""
+        self._replacements: deque[_Replacement] = deque()
+        """Workers whose next process is not started yet."""
+        self._warnings: list[str] = []
         self._begun = False
         self._next_check = 0.0
         """Time from which on workers are checked again for one that is stuck."""
@@ -158,6 +166,10 @@ class Dispatcher:
             by_position |= zip(group.positions, group.worker.results or (), strict=True)
         return [by_position[position] for position in range(len(by_position))]
 
+    def reads_old_actions(self) -> bool:
+        """Return whether a worker may still read the shared actions of a step that was given up."""
+        return any(worker.is_behind for worker in self._workers)
+
     def under_way(self) -> int:
         """Return the number of environments whose answer has not come, or was not collected."""
         return len(self._ready) + sum(len(worker.pending) for worker in self._workers)
@@ -235,12 +247,15 @@ class Dispatcher:
         worker.set_deadline()
 
     def _begin(self, worker: WorkerProcess) -> None:
-        """Send the arrays to a worker that has made its environments."""
+        """Send the arrays to a worker that has made its environments, once."""
+        if worker.has_arrays:
+            return  # an interrupt came afterwards
         memory = self._memory if self._shares(worker) else None
         shape = self._shape if memory else self._shape._replace(num_envs=len(worker.numbers))
         last = worker.arrays.pack(slice(None), shared=bool(memory)) if worker.lost else None
         begin = Begin(shape, memory, last, worker.lost)
         self._workers.send(worker, reduction.dumps(begin))
+        worker.has_arrays = True
 
     def _shares(self, worker: WorkerProcess) -> bool:
         memory, hello = self._memory, worker.hello
@@ -251,17 +266,38 @@ class Dispatcher:
     def _wait(self, enough: Callable[[], bool], timeout: float | None) -> None:
         """Wait until ``enough``; raise the first failure."""
         deadline = None if timeout is None else time.monotonic() + timeout
+        self._start_replacements()  # those that an interrupt has prevented
         while not enough():
             left = DOZE if deadline is None else min(DOZE, deadline - time.monotonic())
             if left < 0:
                 raise WaitedTooLong(f"not all environments answered within {timeout:g} s")
-            received = self._workers.receive(left)
-            for worker, message in received:
-                self._on_message(worker, message)
+            was_silent = not self._receive(left)
             self._kill_stuck_workers()
-            if not received:  # else a step is in progress, which a move would delay
+            if was_silent:  # else a step is in progress, which a move would delay
                 self._move_idle_workers()
+            self._show_warnings()
+        self._show_warnings()
         self._raise_failure()
+
+    def _receive(self, timeout: float) -> bool:
+        """Receive messages and deal with them; return False if none comes in ``timeout`` seconds.
+
+        An interrupt does not lose a message: the next call deals with it again.
+        """
+        received = self._workers.received
+        if not received:
+            self._workers.receive(timeout)
+        has_received = bool(received)
+        while received:
+            worker, message = received[0]
+            try:
+                self._on_message(worker, message)
+            except Exception:
+                if not isinstance(message, Ended):
+                    received.popleft()
+                raise
+            received.popleft()
+        return has_received
 
     def _kill_stuck_workers(self) -> None:
         now = time.monotonic()
@@ -273,9 +309,9 @@ class Dispatcher:
     def _on_message(self, worker: WorkerProcess, message: Any) -> None:
         match message:
             case Ended():
-                self._on_process_end(worker)
+                self._on_process_end(worker, message.process)
             case WorkerHello():
-                worker.hello = message
+                worker.hello, worker.is_behind = message, False
                 if self._begun:
                     self._resume(worker)
             case EnvironmentFailure():
@@ -286,6 +322,7 @@ class Dispatcher:
                 if not _only_reports_losses(message):
                     worker.deaths = worker.disruptions = 0
                 if message.generation == worker.generation:
+                    worker.is_behind = False
                     self._failures += [self._numbered(worker, each) for each in message.failures]
                     if isinstance(message, Answer):
                         self._answer(worker, message)
@@ -308,7 +345,8 @@ class Dispatcher:
         for note in answer.notes:
             self._notes[first + note.row] = note
             if note.lost not in (None, worker.lost):
-                self._warn(f"environment {first + note.row} replaced: {note.lost}")
+                number = first + note.row
+                self._warnings.append(f"environment {number} replaced: {note.lost}")
         worker.set_deadline()
 
     def _blame(self, worker: WorkerProcess, error: Exception) -> None:
@@ -341,10 +379,12 @@ class Dispatcher:
 
     # Ends
 
-    def _on_process_end(self, worker: WorkerProcess) -> None:
+    def _on_process_end(self, worker: WorkerProcess, process: Process) -> None:
         """Note that the process of a worker has ended."""
         if worker.error is not None:
             return  # it sent the reason before
+        if worker.process is not process or self._is_being_replaced(worker):
+            return  # an interrupt came when nearly all was done
         error = worker.death(self._at_work(worker))
         if not self._may_be_replaced(worker):
             self._lose(worker, error)
@@ -353,15 +393,15 @@ class Dispatcher:
             # The methods of the call that have run are unknown.
             worker.results = []
             self._failures.append((worker.setup.first, error))
-        self._warn(f"{worker.whose()} replaced: {error}")
-        self._restart_process(worker, self._workers.drop, str(error), error)
+        self._replace(worker, self._workers.drop, str(error), error)
+        self._warnings.append(f"{worker.whose()} replaced: {error}")
 
     def _may_be_replaced(self, worker: WorkerProcess) -> bool:
         if worker.disrupted:
             return worker.disruptions <= self._disruptions
         return self._begun and self._restart and worker.deaths <= ATTEMPTS
 
-    def _restart_process(
+    def _replace(
         self,
         worker: WorkerProcess,
         let_go: Callable[[WorkerProcess], None],
@@ -369,14 +409,28 @@ class Dispatcher:
         error: Exception,
     ) -> None:
         """Start another process for the worker's environments; if that fails, report ``error``."""
-        try:
-            let_go(worker)
-            worker.hello, worker.deadline = None, None
-            worker.lost = why if self._begun else None
-            self._workers.start(worker)
-        except BaseException:
-            self._lose(worker, error)
-            raise
+        worker.hello, worker.deadline = None, None
+        worker.lost = why if self._begun else None
+        self._replacements.append(_Replacement(worker, let_go, error))
+        self._start_replacements()
+
+    def _start_replacements(self) -> None:
+        """Start the processes.  After an interrupt, the next call goes on."""
+        while self._replacements:
+            worker, let_go, error = self._replacements[0]
+            try:
+                if not worker.is_released:
+                    let_go(worker)
+                    worker.is_released = True
+                self._workers.start(worker)
+            except Exception:
+                self._replacements.popleft()
+                self._lose(worker, error)
+                raise
+            self._replacements.popleft()
+
+    def _is_being_replaced(self, worker: WorkerProcess) -> bool:
+        return any(each.worker is worker for each in self._replacements)
 
     def _is_called(self, worker: WorkerProcess) -> bool:
         return any(group.worker is worker and worker.results is None for group in self._calls)
@@ -400,10 +454,10 @@ class Dispatcher:
         if worker.disruptions >= self._disruptions:
             return  # it stays until the host ends; its error then says so
         lost = f"the host of worker {worker.name!r} is about to go: {why}"
-        self._warn(f"{worker.whose()} replaced: {lost}")
         worker.disruptions += 1
         error = StartError(f"worker {worker.name!r} on another host", lost)
-        self._restart_process(worker, self._workers.release, lost, error)
+        self._replace(worker, self._workers.release, lost, error)
+        self._warnings.append(f"{worker.whose()} replaced: {lost}")
 
     def _at_work(self, worker: WorkerProcess) -> int | None:
         """Return the row that a worker of this host was busy with; None if unknown."""
@@ -425,8 +479,16 @@ class Dispatcher:
         if resets:
             self._send(worker, _reset_command(worker, list(resets), resets))
 
-    def _warn(self, message: str) -> None:
-        warnings.warn(message, RuntimeWarning, stacklevel=2)
+    def _show_warnings(self) -> None:
+        """Show the warnings, once all messages are dealt with: a warning may be made an error."""
+        messages, self._warnings = self._warnings, []
+        for at, message in enumerate(messages, 1):
+            try:
+                warnings.warn(message, RuntimeWarning, stacklevel=_caller_level())
+            except RuntimeWarning as error:
+                for other in messages[at : at + _SHOWN]:
+                    add_note(error, f"another warning: {other}")
+                raise
 
 
 def _encoded(
@@ -445,6 +507,14 @@ def _reset_command(
 ) -> bytes:
     seeds = [each.seed for each in pending.values()]
     return _encoded(worker, "reset", rows, seeds, [each.options for each in pending.values()])
+
+
+def _caller_level() -> int:
+    """Return the ``stacklevel`` of a warning that shows the first line outside of this package."""
+    frame, level = sys._getframe(1), 1
+    while frame.f_back is not None and frame.f_code.co_filename.startswith(_PACKAGE):
+        frame, level = frame.f_back, level + 1
+    return level
 
 
 def _all_are(
@@ -470,6 +540,16 @@ def _only_reports_losses(message: Answer | Results) -> bool:
     if not isinstance(message, Answer) or message.rows is None:
         return False
     return all(note.lost for note in message.notes) and len(message.notes) == len(message.rows)
+
+
+class _Replacement(NamedTuple):
+    """Worker that gets another process."""
+
+    worker: WorkerProcess
+    let_go: Callable[[WorkerProcess], None]
+    """Function that lets go of its process."""
+    error: Exception
+    """Error to report if the other process cannot be started."""
 
 
 class _CommandPart(NamedTuple):

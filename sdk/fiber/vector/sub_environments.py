@@ -103,7 +103,7 @@ class SubEnvironments:
         """
         count = len(self.arrays.rewards) if numbers is None else len(numbers)
         columns = self.arrays.actions
-        if columns.fits(actions, count):
+        if columns.fits(actions, count) and not self.dispatcher.reads_old_actions():
             columns.fill(slice(None) if numbers is None else numbers, actions)
             self.dispatcher.step(numbers, None, together=together)
             return

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import contextlib
+import operator
 from collections.abc import Callable, Iterator, Sequence
 from copy import deepcopy
 from functools import partial
@@ -332,7 +333,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[Any, Any, npt.NDArray[Any]]):
         if env_ids is None:
             numbers = range(self.num_envs) if self._received is None else self._received
         else:
-            numbers = [int(number) for number in env_ids]
+            numbers = [operator.index(number) for number in env_ids]
         odd = [number for number in numbers if not 0 <= number < self.num_envs]
         if odd or len(set(numbers)) != len(numbers):
             raise ValueError(

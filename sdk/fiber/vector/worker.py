@@ -38,6 +38,9 @@ WEIGHT = 0.1
 """Weight of the last step in the expected duration of an environment's step."""
 
 
+CLOSE = "close"
+"""Operation that ends the worker."""
+
 _UNPICKLABLE = "an answer that cannot be pickled"
 
 
@@ -102,7 +105,9 @@ def serve(connection: Connection, setup: Setup) -> None:
     slots: list[Slot] = []
     try:
         if _make_all(connection, setup, slots):
-            EnvironmentWorker(connection, setup, slots, connection.recv()).run()
+            begin = connection.recv()
+            if isinstance(begin, Begin):  # else the learner wants no environments
+                EnvironmentWorker(connection, setup, slots, begin).run()
     except (EOFError, BrokenPipeError):
         pass  # the learner has ended, or has closed the environments
     finally:
@@ -175,9 +180,11 @@ class EnvironmentWorker:
         }
 
     def run(self) -> None:
-        """Carry out commands until the connection ends, with EOFError."""
+        """Carry out commands until ``CLOSE``, or the end of the connection with EOFError."""
         while True:
             operation, *arguments = self._next_command()
+            if operation == CLOSE:
+                return
             self._operations[operation](*arguments)
 
     def _next_command(self) -> Any:
@@ -447,8 +454,10 @@ class EnvironmentFailure(NamedTuple):
 
 
 def summary(error: BaseException) -> str:
-    """Return the last line of the traceback of ``error``."""
-    return "".join(traceback.format_exception_only(error)).strip()
+    """Return the last line of the traceback of ``error``, and where it was raised."""
+    line = "".join(traceback.format_exception_only(error)).strip()
+    frames = traceback.extract_tb(error.__traceback__)
+    return f"{line} ({frames[-1].filename}:{frames[-1].lineno})" if frames else line
 
 
 class TimeLimit:

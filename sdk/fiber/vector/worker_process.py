@@ -18,7 +18,7 @@ from fiber.errors import UnpicklableError, WorkerDied, block
 from fiber.process import Process
 from fiber.resources import largest, resources_of, with_resources
 from fiber.vector.arrays import StepArrays
-from fiber.vector.worker import Setup, WorkerHello, serve
+from fiber.vector.worker import CLOSE, Setup, WorkerHello, serve
 
 NEWS = 2.0
 """Seconds from the end of a process's connection to the report of its end."""
@@ -30,6 +30,9 @@ LIMITS_OF_A_RESTART = 4
 """Number of times that ``timeout`` may pass for an environment that is replaced: for its step, its
 end, the making of the new one, and the step of the new one.
 """
+
+
+_CLOSE = reduction.dumps((CLOSE,))
 
 
 class PendingCommand(NamedTuple):
@@ -60,6 +63,8 @@ class WorkerProcess:
         """Number of the present generation of commands.  Answers to earlier ones are ignored."""
         self.pending: dict[int, PendingCommand] = {}
         """Unanswered commands by row."""
+        self.is_behind = False
+        """True while it may still be carrying out commands that were given up."""
         self.results: list[Any] | None = None
         """Results of the last call of methods; None while they are awaited."""
         self.deadline: float | None = None
@@ -71,6 +76,10 @@ class WorkerProcess:
         """Number of processes that the cluster ended, or that moved, since the last answer."""
         self.disrupted = False
         """True if the cluster ended the process before this one."""
+        self.has_arrays = False
+        """True once the process was sent the arrays."""
+        self.is_released = False
+        """True from the end of one process until the start of the next."""
         self.lost: str | None = None
         """Reason why the process before this one ended."""
         self.error: Exception | None = None
@@ -88,6 +97,7 @@ class WorkerProcess:
             )
             try:
                 self.process.start()
+                self.is_released = self.has_arrays = False
             except BaseException as error:
                 self.connection.close()
                 if isinstance(error, UnpicklableError):
@@ -148,6 +158,7 @@ class WorkerProcess:
     def give_up(self) -> None:
         """Ignore the answers to all commands so far."""
         self.generation += 1
+        self.is_behind = self.is_behind or bool(self.pending)
         self.pending.clear()
         self.deadline = None
 
@@ -172,7 +183,11 @@ class WorkerProcess:
             popen.kill_with_stack()
 
     def hang_up(self, *, kill: bool) -> None:
-        """Close the connection, so that the worker ends.  ``kill``: kill its process."""
+        """Ask the worker to end, and close the connection.  ``kill``: kill its process."""
+        if not kill:
+            # A forked copy of this process may keep the connection open: its end is not enough.
+            with contextlib.suppress(OSError):
+                self.connection.send_bytes(_CLOSE)
         self.connection.close()
         if kill:
             with contextlib.suppress(ValueError):  # closed just before Ctrl-C
@@ -202,8 +217,10 @@ def end(process: Process, timeout: float | None) -> None:
         process.close()
 
 
-class Ended:
+class Ended(NamedTuple):
     """Mark in place of a message: the process has ended."""
+
+    process: Process
 
 
 class Unreadable(NamedTuple):
@@ -217,12 +234,14 @@ class WorkerGroup:
 
     def __init__(self, workers: Sequence[WorkerProcess]) -> None:
         self._workers = workers
+        self.received: deque[tuple[WorkerProcess, Any]] = deque()
+        """Messages that were received.  The caller removes each once it has dealt with it."""
         self._started: list[WorkerProcess] = []
         """Workers whose process must be closed."""
         self._released: list[Process] = []
         """Live processes that were asked to end."""
-        self._ended: deque[WorkerProcess] = deque()
-        """Workers whose end was noticed, and not reported yet."""
+        self._ended: deque[tuple[WorkerProcess, Process]] = deque()
+        """Workers whose process has ended, as was noticed and not reported yet."""
         self._poller = select.epoll()
         self._by_descriptor: dict[int, WorkerProcess] = {}
         """Workers by descriptor."""
@@ -244,45 +263,47 @@ class WorkerGroup:
             self._poller.register(descriptor, select.EPOLLIN)
 
     def drop(self, worker: WorkerProcess) -> None:
-        """Close a process that has ended."""
+        """Close a process that has ended.  It may be called again after an interrupt."""
         self._forget(worker)
         worker.close(0)
-        self._started.remove(worker)
+        self._remove(worker)
 
     def release(self, worker: WorkerProcess) -> None:
-        """Ask a live process to close its environments and end."""
+        """Ask a live process to close its environments and end.
+
+        It may be called again after an interrupt.
+        """
         self._forget(worker)
-        self._ended = deque(each for each in self._ended if each is not worker)
         worker.hang_up(kill=False)
         running = [process for process in self._released if process.exitcode is None]
         self._released = [*running, worker.process]
-        self._started.remove(worker)
+        self._remove(worker)
 
     def send(self, worker: WorkerProcess, data: bytes) -> None:
         """Send a pickled command.  If the worker has ended, ``receive`` reports that next."""
         try:
             worker.connection.send_bytes(data)
         except OSError:
-            self._ended.append(worker)
+            self._ended.append((worker, worker.process))
 
-    def receive(self, timeout: float) -> list[tuple[WorkerProcess, Any]]:
-        """Return messages of workers; none after ``timeout`` seconds."""
-        received: list[tuple[WorkerProcess, Any]] = []
+    def receive(self, timeout: float) -> None:
+        """Add messages of workers to ``received``; none after ``timeout`` seconds."""
         for descriptor, _ in self._poller.poll(0 if self._ended else timeout):
             worker = self._by_descriptor[descriptor]
             if descriptor == worker.process.sentinel:
-                received += [(worker, message) for message in _rest(worker)]
-                self._ended.append(worker)
-            elif worker not in self._ended:  # else all its messages were received already
+                self.received += [(worker, message) for message in _rest(worker)]
+                self._ended.append((worker, worker.process))
+            elif (worker, worker.process) not in self._ended:  # else all was received already
                 try:
-                    received.append((worker, _received(worker)))
+                    self.received.append((worker, _received(worker)))
                 except (EOFError, OSError):
-                    self._ended.append(worker)
+                    self._ended.append((worker, worker.process))
         while self._ended:
-            worker = self._ended.popleft()
-            if self._forget(worker):
-                received.append((worker, Ended()))
-        return received
+            worker, process = self._ended[0]  # an interrupt must not lose it
+            if worker.process is process and worker in self._by_descriptor.values():
+                self.received.append((worker, Ended(process)))
+                self._forget(worker)
+            self._ended.popleft()
 
     def close(self, timeout: float | None) -> None:
         """Wait until all workers have ended; kill the others after ``timeout`` seconds."""
@@ -303,13 +324,16 @@ class WorkerGroup:
             self._released.pop()
         self._poller.close()
 
-    def _forget(self, worker: WorkerProcess) -> bool:
-        """Stop receiving from a worker; return False if that had happened before."""
-        descriptors = [fd for fd, other in self._by_descriptor.items() if other is worker]
-        for descriptor in descriptors:
+    def _forget(self, worker: WorkerProcess) -> None:
+        """Stop receiving from a worker."""
+        for descriptor in [fd for fd, other in self._by_descriptor.items() if other is worker]:
+            with contextlib.suppress(OSError):  # closed by the garbage collector
+                self._poller.unregister(descriptor)
             del self._by_descriptor[descriptor]
-            self._poller.unregister(descriptor)
-        return bool(descriptors)
+
+    def _remove(self, worker: WorkerProcess) -> None:
+        if worker in self._started:
+            self._started.remove(worker)
 
 
 def _received(worker: WorkerProcess) -> Any:
