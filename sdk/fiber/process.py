@@ -54,9 +54,11 @@ class Process(BaseProcess):
         from fiber._runtime.start_methods import start_zygote
 
         start_zygote()
+        from fiber._runtime import interrupted_exit
         from fiber._runtime.popen import Popen
         from fiber._runtime.start_methods import zygote_method
 
+        interrupted_exit.prepare()
         return Popen(self, zygote_method(self._start_method), self._on_exit())
 
     def _on_exit(self) -> Callable[[], None]:

@@ -92,6 +92,12 @@ def ignore_sigterm(connection: Any) -> NoReturn:
     block()
 
 
+def ignore_sigint(connection: Any) -> NoReturn:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    connection.send("ready")
+    block()
+
+
 def exit_on_sigterm(connection: Any) -> NoReturn:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(42))
     connection.send("ready")

@@ -140,6 +140,80 @@ def test_uncaught_it_ends_the_program_and_all_of_it(
     assert program.stderr.count("KeyboardInterrupt") == 1
 
 
+UNCAUGHT_WITH_CHILDREN = """
+    import fiber
+    from faults import targets
+
+    def start_another(connection):
+        fiber.Process(target=targets.block).start()
+        targets.report_and_block(connection)
+
+    if __name__ == "__main__":
+        ours, theirs = fiber.Pipe()
+        child = fiber.Process(target={target}, args=(theirs,), name="the child")
+        child.start()
+        ours.recv()
+        print("ready", flush=True)
+        child.join()
+"""
+
+
+@pytest.mark.parametrize("backend", ["local", "loopback"])
+@pytest.mark.parametrize("target", ["targets.report_and_block", "start_another"])
+def test_uncaught_it_ends_processes_that_the_program_waits_for(
+    launch: Callable[..., Program], target: str, backend: str
+) -> None:
+    script = UNCAUGHT_WITH_CHILDREN.format(target=target)
+    program = launch(script, env={"FIBER_BACKEND": backend}, process_group=0)
+    assert program.line() == "ready"
+    os.killpg(program.pid, signal.SIGINT)
+    assert program.wait() == -signal.SIGINT
+    assert program.left() == []
+
+
+@pytest.mark.parametrize("backend", ["local", "loopback"])
+def test_it_names_the_processes_that_ignore_it_and_a_second_one_ends_them(
+    launch: Callable[..., Program], backend: str
+) -> None:
+    script = UNCAUGHT_WITH_CHILDREN.format(target="targets.ignore_sigint")
+    program = launch(script, env={"FIBER_BACKEND": backend}, process_group=0)
+    assert program.line() == "ready"
+    os.killpg(program.pid, signal.SIGINT)
+    wait_for(lambda: "processes that go on after Ctrl-C: the child." in program.stderr)
+    os.killpg(program.pid, signal.SIGINT)
+    assert program.wait() == -signal.SIGINT
+    assert program.left() == []
+    assert "Exception ignored" not in program.stderr
+    assert program.stderr.count("Traceback") == 1
+
+
+@pytest.mark.parametrize("backend", ["local", "loopback"])
+def test_caught_it_leaves_the_processes_alone(launch: Callable[..., Program], backend: str) -> None:
+    program = launch(CAUGHT, env={"FIBER_BACKEND": backend}, process_group=0)
+    interrupt(program, group=True)
+    assert program.finish() == ""
+    assert program.stderr == ""
+
+
+CAUGHT = """
+    import fiber
+    from faults import targets
+    if __name__ == "__main__":
+        ours, theirs = fiber.Pipe()
+        child = fiber.Process(target=targets.echo, args=(theirs,))
+        child.start()
+        theirs.close()
+        print("ready", flush=True)
+        try:
+            ours.recv()
+        except KeyboardInterrupt:
+            print("interrupted", flush=True)
+        ours.send("still there")
+        assert ours.recv() == "still there"
+        ours.close()
+"""
+
+
 IMPATIENT = """
     import fiber, time
     from faults import targets

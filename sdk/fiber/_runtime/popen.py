@@ -154,6 +154,10 @@ class Popen:
         self._exited.wait(timeout)
         return self.returncode
 
+    def interrupt(self) -> None:
+        """Send SIGINT."""
+        self._signal(signal.SIGINT)
+
     def terminate(self) -> None:
         """Send SIGTERM."""
         self._signal(signal.SIGTERM)
