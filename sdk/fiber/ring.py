@@ -152,6 +152,7 @@ class Ring(Generic[_T]):
         links = [Pipe(duplex=False) for _ in range(self.size)]
         channels = [Pipe() for _ in range(self.size)]
         processes: list[Process] = []
+        ended = False
         try:
             for rank in range(self.size):
                 (_, to_next), (from_previous, _) = links[rank], links[rank - 1]
@@ -162,15 +163,35 @@ class Ring(Generic[_T]):
                 processes.append(process)
             _close([end for link in links for end in link])
             _close([of_member for _, of_member in channels])
-            return _await_all([of_program for of_program, _ in channels])
-        except BaseException:
-            for process in processes:
-                process.kill()
-            raise
+            results = _await_all([of_program for of_program, _ in channels])
+            ended = True
+            return results
         finally:
-            for process in processes:
-                process.join()
-            _close([end for pair in (*links, *channels) for end in pair])
+            try:
+                _end(processes, kill=not ended)
+            finally:
+                _close([end for pair in (*links, *channels) for end in pair])
+
+
+def _end(processes: list[Process], *, kill: bool) -> None:
+    """Wait for the members; with ``kill``, and also if Ctrl-C ends the wait, kill them first."""
+    try:
+        if kill:
+            _kill(processes)
+        for process in processes:
+            process.join()
+    except BaseException:
+        _kill(processes)
+        raise
+
+
+def _kill(processes: list[Process]) -> None:
+    try:
+        for process in processes:
+            process.kill()
+    except BaseException:  # interrupted: those that are left must not run on
+        _kill(processes)
+        raise
 
 
 def _await_all(channels: list[Connection]) -> list[Any]:
