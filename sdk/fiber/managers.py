@@ -9,6 +9,7 @@ dropped, and the locks that it held are released: the locks of a manager are Fib
 from __future__ import annotations
 
 import contextlib
+import sys
 import threading
 import weakref
 from collections.abc import Callable, Iterable
@@ -232,13 +233,21 @@ class BaseManager(mp_managers.BaseManager):
     @staticmethod
     def _end(process: Process, known: list[Any], *rest: Any) -> None:
         """End the server: in ``shutdown``, at the program's end, or from the garbage collector."""
+        if sys.is_finalizing():
+            # Ctrl-C ended the exit functions.  The loop thread no longer runs, so no wait for the
+            # server would end.  The server ends with the program.
+            return
         if runtime().loop.on_thread():  # the loop must not wait for itself
             threading.Thread(target=BaseManager._end, args=(process, known, *rest)).start()
             return
         address = known[0] if known else None
-        if address is None:
-            process.terminate()
-        _mp.BaseManager._finalize_manager(process, address, *rest)
+        try:
+            if address is None:
+                process.terminate()
+            _mp.BaseManager._finalize_manager(process, address, *rest)
+        except BaseException:  # interrupted: the server may not know that it must end
+            process.kill()
+            raise
         if isinstance(address, ManagerAddress):
             client.forget(address)
 

@@ -240,6 +240,54 @@ def test_an_impatient_user_presses_it_again_and_again(launch: Callable[..., Prog
     assert program.left() == []
 
 
+INTERRUPTED_SHUTDOWN = """
+    import fiber
+    from multiprocessing import managers
+
+    real = managers.dispatch
+
+    def dispatch(connection, ident, method, *arguments):
+        if method == "shutdown":
+            raise KeyboardInterrupt
+        return real(connection, ident, method, *arguments)
+
+    if __name__ == "__main__":
+        with fiber.Manager():
+            managers.dispatch = dispatch
+"""
+
+
+@pytest.mark.parametrize("backend", ["local", "loopback"])
+def test_an_interrupt_during_the_shutdown_of_a_manager_ends_its_server(
+    launch: Callable[..., Program], backend: str
+) -> None:
+    program = launch(INTERRUPTED_SHUTDOWN, env={"FIBER_BACKEND": backend})
+    assert program.wait() == -signal.SIGINT
+    assert program.left() == []
+
+
+INTERRUPTED_EXIT = """
+    import fiber
+    from multiprocessing import util
+
+    def interrupt():
+        raise KeyboardInterrupt
+
+    if __name__ == "__main__":
+        manager = fiber.Manager()
+        util.Finalize(None, interrupt, exitpriority=1)
+"""
+
+
+@pytest.mark.parametrize("backend", ["local", "loopback"])
+def test_an_interrupt_of_the_exit_functions_ends_the_server_of_a_manager(
+    launch: Callable[..., Program], backend: str
+) -> None:
+    program = launch(INTERRUPTED_EXIT, env={"FIBER_BACKEND": backend})
+    assert program.wait() == 0
+    assert program.left() == []
+
+
 PRINTS_FROM_A_CHILD = """
 import fcntl, fiber, termios
 
