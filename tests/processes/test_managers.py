@@ -378,6 +378,23 @@ def test_an_item_of_an_interrupted_call_goes_to_the_next(
     assert [queue.get(), queue.get()] == [1, 2]
 
 
+def test_no_call_waits_behind_a_call_that_was_interrupted_twice(
+    manager: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    queue, sizes = manager.Queue(), []
+
+    def interrupt_twice() -> None:
+        with monkeypatch.context() as patch:
+            patch.setattr(CallChannel, "answer", interrupt)
+            patch.setattr(CallChannel, "take_back", interrupt)
+            with pytest.raises(KeyboardInterrupt):
+                queue.get()
+        sizes.append(queue.qsize())
+
+    background(interrupt_twice).join(PATIENCE)
+    assert sizes == [0]
+
+
 def test_an_interruption_does_not_undo_an_earlier_call(
     manager: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -357,6 +357,7 @@ class ManagerConnection:
             kind, result = channel.answer()
         except ConnectionClosed as error:
             if isinstance(error, ObjectUnreachable):
+                channel.busy = False
                 raise  # an object in the answer is unreachable, not the server
             self._session.give_up(channel)
             raise self._session.closed_error() from error
@@ -365,9 +366,10 @@ class ManagerConnection:
             # by a signal's handler.
             if not (channel.answered and isinstance(error, Exception)):
                 channel.take_back()
-            raise
-        finally:
+            # If a second interrupt prevents this, no later call waits behind the unanswered one.
             channel.busy = False
+            raise
+        channel.busy = False
         return self._interpret(kind, result, request)
 
     def _interpret(self, kind: str, result: Any, request: Request) -> tuple[str, Any]:
