@@ -44,7 +44,7 @@ from fiber._runtime.jobs import CallQueue
 from fiber._runtime.options import PoolOptions
 from fiber._runtime.state import runtime
 from fiber._runtime.threads import BackgroundThread
-from fiber._runtime.work_items import WorkItem
+from fiber._runtime.work_items import InputClosed, WorkItem
 from fiber._wire import work
 from fiber.process import PoolProcess, process_type
 from fiber.resources import Resources, merged, wished
@@ -132,6 +132,7 @@ class Executor(concurrent.futures.Executor):
                 idle_timeout=options.seconds("idle_timeout", idle_timeout) or math.inf,
                 resources=Resources(pool=pool),
                 calls_back_at_end=True,
+                closes_streams=True,
                 refusal=refusal,
             ),
             runtime(),
@@ -211,14 +212,16 @@ class Executor(concurrent.futures.Executor):
         It raises TimeoutError if a result is not there ``timeout`` seconds after this call.  It
         ends with the first error, and cancels the tasks that have not begun.  ``chunksize`` items
         go to one worker together.  Another thread reads iterators, a little faster than their tasks
-        run.  With ``buffersize`` it reads at most so many items ahead of the results taken.
-        ``progress`` as in ``Pool.map``.
+        run.  With ``buffersize`` it reads at most so many items ahead of the results taken.  After
+        ``shutdown`` it reads none: the results of the items before come, then, if there are further
+        items, RuntimeError.  ``progress`` as in ``Pool.map``.
         """
         deadline = None if timeout is None else time.monotonic() + timeout
         ahead = options.buffersize(buffersize)
         unit = options.chunksize(chunksize)
         several = len(iterables) != 1
         source = zip(*iterables, strict=False) if several else _iterable(iterables[0])
+        rest = iter(source) if ahead is not None else None
         engine = self._group.executor_for(fn, self._wishes)
         results: IMapIterator[Any] = IMapIterator(self._group)
         try:
@@ -233,10 +236,10 @@ class Executor(concurrent.futures.Executor):
             )
         except Exception as error:  # it does not pickle
             engine.reject(results._buffer, error)
-            return _taken(results, engine, None, deadline)
+            return _taken(results, engine, None, deadline, None)
         reports.follow(item, progress, iterables, engine.workers.busy)
-        results._begin(engine, item, source, ahead)
-        return _taken(results, engine, item, deadline)
+        results._begin(engine, item, source if rest is None else rest, ahead)
+        return _taken(results, engine, item, deadline, rest)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Take no more tasks.  The workers end once the present tasks are done.
@@ -459,17 +462,31 @@ def _iterable(given: Any) -> Iterable[Any]:
 
 
 def _taken(
-    results: IMapIterator[Any], engine: PoolExecutor, item: WorkItem | None, deadline: float | None
+    results: IMapIterator[Any],
+    engine: PoolExecutor,
+    item: WorkItem | None,
+    deadline: float | None,
+    rest: Iterator[Any] | None,
 ) -> Iterator[Any]:
-    """Yield the results of a map, up to the first error."""
+    """Yield the results of a map, up to the first error.
+
+    ``rest`` is the input of a map with ``buffersize``.
+    """
     try:
         # In a list, so that this frame keeps no result that the user has dropped.
         while held := _next(results, engine, deadline):
             yield held.pop()
+    except InputClosed:
+        # As in Python 3.14: only the user reads input after the shutdown, one item at most.
+        if rest is not None and next(rest, _END) is not _END:
+            raise refusal() from None
     finally:
         if item is not None:
             engine.cancel(item)
             reports.reporter.finish(item)
+
+
+_END = object()
 
 
 def _next(results: IMapIterator[Any], engine: PoolExecutor, deadline: float | None) -> list[Any]:

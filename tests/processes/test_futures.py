@@ -255,6 +255,34 @@ def test_map_reads_no_more_than_its_buffer(executor: fiber.Executor) -> None:
     results.close()
 
 
+def _refused(refused: bool) -> contextlib.AbstractContextManager[object]:
+    if not refused:
+        return contextlib.nullcontext()
+    return pytest.raises(RuntimeError, match="cannot schedule new futures after shutdown")
+
+
+@pytest.mark.parametrize("size", [3, 5, 6, 300])
+@pytest.mark.parametrize("unit", [1, 2])
+def test_after_shutdown_a_map_reads_no_more_than_its_buffer(size: int, unit: int) -> None:
+    read: list[int] = []
+
+    def numbers() -> Iterator[int]:
+        for n in range(size):
+            read.append(n)
+            yield n
+
+    with fiber.Executor(2) as executor:
+        results = executor.map(tasks.square, numbers(), buffersize=4, chunksize=unit)
+        taken = [next(results)]
+        executor.shutdown()
+        allowed = min(size, 5 // unit * unit)
+        assert len(read) == allowed
+    with _refused(size > allowed):
+        taken.extend(results)
+    assert taken == [n * n for n in range(allowed)]
+    assert len(read) == min(size, allowed + 1)
+
+
 def test_map_of_an_item_that_does_not_pickle(executor: fiber.Executor) -> None:
     results = executor.map(tasks.ExitingInMaster(), [1])
     with pytest.raises(BaseException, match=r".*"):

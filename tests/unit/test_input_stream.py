@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from fiber._engine.chunks import TARGET, TaskPace
-from fiber._runtime.work_items import AHEAD, InputStream
+from fiber._runtime.work_items import AHEAD, InputClosed, InputStream
 from unit.ledger_steps import known
 
 SLOW_TASKS = known(1.0, 1)
@@ -101,6 +101,27 @@ def test_each_grant_brings_it_to_the_bound_and_none_comes_before_half_is_gone() 
     assert reading.stream._granted == 2 * AHEAD, "more than half is left"
     reading.grant(waiting=AHEAD - 1, workers=2)
     assert reading.stream._granted == 3 * AHEAD
+
+
+def test_a_closed_stream_with_a_limit_reads_up_to_the_limit() -> None:
+    reading = Reading(limit=5)
+    reading.grant()
+    reading.consume()
+    reading.stream.close()
+    reading.stream.close()
+    reading.stream.lift_limit()
+    reading.grant(workers=100)
+    with pytest.raises(InputClosed):
+        reading.here(range(1000))
+    assert reading.stream.take() == list(range(6))
+
+
+def test_a_closed_stream_without_a_limit_reads_on() -> None:
+    reading = Reading()
+    reading.stream.close()
+    reading.grant()
+    reading.here(range(AHEAD - 1))
+    assert reading.stream.take() == list(range(AHEAD - 1))
 
 
 def test_an_input_stream_reads_further_ahead_for_quick_tasks() -> None:

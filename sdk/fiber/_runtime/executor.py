@@ -103,11 +103,7 @@ class PoolExecutor:
         )
         self._resources = WorkerResources(options.resources)
         self._launcher = Launcher(
-            options,
-            self._resources,
-            runtime,
-            self._background,
-            on_failed=self._never_started,
+            options, self._resources, runtime, self._background, on_failed=self._never_started
         )
         self._leases = Leases(
             self._scheduler, self._loop, self._activity, on_adopted=self._adopt, on_back=self._back
@@ -561,6 +557,8 @@ class PoolExecutor:
 
     def _close(self) -> None:
         self.calls.close_all()
+        if self.options.closes_streams:
+            self._jobs.close_streams()
         self._scheduler.close()
         self._advance()
 

@@ -115,6 +115,12 @@ class Jobs:
                 item.stream.lift_limit()
                 self.top_up(item)
 
+    def close_streams(self) -> None:
+        """Have the streams with a limit read what they may read now, and no more later."""
+        for item in self._streams:
+            if item.stream is not None:
+                item.stream.close()
+
     def end_stream(self, item: WorkItem, error: BaseException | None) -> None:
         """End the stream of ``item``.  An ``error`` takes the place of the next task."""
         job = item.job

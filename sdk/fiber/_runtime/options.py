@@ -42,6 +42,8 @@ class PoolOptions(NamedTuple):
     """Wishes of workers for their hosts, beside those of the first task's function."""
     calls_back_at_end: bool = False
     """True if callbacks run for calls that termination fails, unlike in multiprocessing."""
+    closes_streams: bool = False
+    """True if a closed pool reads no further input of maps with ``buffersize``."""
     refusal: Callable[[], Exception] = partial(ValueError, "Pool not running")
     """Function that makes the error for calls of a closed pool."""
 

@@ -97,6 +97,10 @@ class FunctionCache:
                 share(buffer)
 
 
+class InputClosed(Exception):
+    """End of a stream that was closed before the reader came to the end of the input."""
+
+
 class InputStream:
     """Input of one job, read from an iterator no faster than workers run it.
 
@@ -126,6 +130,7 @@ class InputStream:
         self._credit: queue.SimpleQueue[int] = queue.SimpleQueue()
         self._granted = 0
         self._taken = 0
+        self._closed = False
         self._awaited = True
         self._refused = 0  # number of times that the executor looked for room
         self._asked = 0  # value of ``_refused`` when it found room, or was last notified
@@ -133,7 +138,10 @@ class InputStream:
     # The reading thread
 
     def read(self, iterable: Iterable[Any]) -> None:
-        """Read all of ``iterable`` on this thread; raise the errors of the iterable."""
+        """Read all of ``iterable`` on this thread; raise the errors of the iterable.
+
+        Raise InputClosed if ``close`` stops the reader before the end.
+        """
         check_may_wait()
         iterator = iter(iterable)
         items, unit = self._items, self._unit
@@ -154,6 +162,8 @@ class InputStream:
             if left:
                 items.extend(chunk)
                 return
+        if self._closed:
+            raise InputClosed
 
     def _next_credit(self) -> int:
         while True:
@@ -207,7 +217,7 @@ class InputStream:
         """Let the reader go on if few tasks are left; ``waiting`` of them have no worker yet."""
         bound = AHEAD * max(workers, 1) * max(pace.message_size(target), self._unit)
         ahead = waiting + self._granted - self._taken
-        if self.ended or 2 * ahead > bound:
+        if self.ended or self._closed or 2 * ahead > bound:
             return
         units = -(-(bound - ahead) // self._unit)
         if self._limit is not None:
@@ -215,8 +225,11 @@ class InputStream:
             units = min(units, self._room(self._limit) // self._unit)
         if units:
             self._asked = self._refused
-            self._granted += units * self._unit
-            self._credit.put(units * self._unit)
+            self._let_read(units)
+
+    def _let_read(self, units: int) -> None:
+        self._granted += units * self._unit
+        self._credit.put(units * self._unit)
 
     def _room(self, limit: int) -> int:
         return limit - (self._granted - self._consumed())
@@ -224,6 +237,19 @@ class InputStream:
     def lift_limit(self) -> None:
         """Read without a limit, for a caller that waits for all results and consumes none."""
         self._limit = None
+
+    def close(self) -> None:
+        """Have the reader use the room that is left below the limit, and stop.
+
+        Do nothing if there is no limit: the caller wants all of the input.
+        """
+        if self._limit is None or self._closed:
+            return
+        self._closed = True
+        units = self._room(self._limit) // self._unit
+        if units > 0:
+            self._let_read(units)
+        self._credit.put(0)
 
     def end(self) -> None:
         """Stop reading."""
