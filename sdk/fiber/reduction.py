@@ -32,7 +32,7 @@ from multiprocessing.reduction import (
 from types import FunctionType, ModuleType
 from typing import Any, ClassVar, cast
 
-from fiber._agent import child
+from fiber._agent import by_reference, child
 from fiber._hub import handles
 from fiber._hub.heap import Segment
 from fiber._wire import packet
@@ -365,21 +365,11 @@ def _by_value_pickler() -> Any:
     class ByValue(cloudpickle.Pickler):  # type: ignore[misc]
         dispatch_table: ClassVar[Any] = ChainMap(
             cast("Any", ForkingPickler)._extra_reducers,
-            {io.TextIOWrapper: _reduce_file},
+            {io.TextIOWrapper: by_reference.reduce_file},
             cloudpickle.Pickler.dispatch_table,
         )
 
     return ByValue
-
-
-def _reduce_file(file: io.TextIOWrapper) -> Any:
-    """Refuse open files.  Without this, cloudpickle would copy their contents."""
-    for name in ("stdout", "stderr"):
-        if file is getattr(sys, name):
-            return getattr, (sys, name)
-    raise TypeError(
-        f"cannot pickle the open file {file.name!r}: pass its path and open it where it is used"
-    )
 
 
 def _dump(

@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable, Iterator
 from functools import partial
 from multiprocessing.pool import MaybeEncodingError, RemoteTraceback  # type: ignore[attr-defined]
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -99,6 +100,16 @@ def test_a_map_with_such_a_result_raises(pool: Pool, chunksize: int | None) -> N
     assert not result.successful()
     with pytest.raises(MaybeEncodingError):
         result.get()
+
+
+@pytest.mark.parametrize("chunksize", [1, 10])
+def test_an_open_file_is_no_result(pool: Pool, tmp_path: Path, chunksize: int) -> None:
+    path = tmp_path / "log"
+    path.write_text("one line")
+    with pytest.raises(MaybeEncodingError, match=f"open file '{path}'"):
+        pool.apply(open, (path,))
+    with pytest.raises(MaybeEncodingError, match="pass its path"):
+        pool.map(open, [path] * 3, chunksize)
 
 
 def test_a_result_that_cannot_even_be_shown(pool: Pool) -> None:

@@ -32,6 +32,17 @@ def dumps(
     return file.getvalue()
 
 
+def reduce_file(file: io.TextIOWrapper) -> Any:
+    """Refuse open files.  Without this function, cloudpickle would copy their contents."""
+    for stream in ("stdout", "stderr"):
+        if file is getattr(sys, stream):
+            return getattr, (sys, stream)
+    name = getattr(file, "name", file)  # a file in memory has none
+    raise TypeError(
+        f"cannot pickle the open file {name!r}: pass its path and open it where it is used"
+    )
+
+
 def find(name: str, tracker_id: str | None) -> Any:
     """Return the object that ``__main__`` calls ``name``.
 
@@ -70,6 +81,7 @@ def _by_reference() -> Any:
             own = (
                 {} if reducers is None else reducers,
                 cast("Any", ForkingPickler)._extra_reducers,
+                {io.TextIOWrapper: reduce_file},
             )
             self.dispatch_table = ChainMap(*own, cloudpickle.Pickler.dispatch_table)
             super().__init__(file, protocol, buffer_callback)  # reads the table, once
