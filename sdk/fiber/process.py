@@ -136,6 +136,19 @@ class PoolProcess(Process):
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_handle": None}
 
+    @property
+    def user_parts(self) -> dict[str, Any]:
+        """Parts of the worker that the pool's user gave, by the names that messages use."""
+        args: tuple[Any, ...] = self._args  # type: ignore[attr-defined]
+        if not args:  # they are pickled already, and go beside the process
+            return {}
+        initializer, initargs, retryable = args
+        return {
+            "the initializer of the pool": initializer,
+            **{f"initargs[{at}] of the pool": value for at, value in enumerate(initargs)},
+            "retry_exceptions of the pool": retryable,
+        }
+
     def _Popen(self) -> WorkerHandle:
         from fiber._runtime.start_methods import zygote_method
 

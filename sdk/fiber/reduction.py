@@ -158,11 +158,13 @@ def dump_shared(obj: Any, *, same_host: bool) -> bytes | None:
 
 def _blame_process(process: Any, reason: Exception) -> UnpicklableError:
     """Return the error that names the part of a Process that does not pickle."""
-    parts = {"the target": process._target}
-    parts |= {f"argument {index}": value for index, value in enumerate(process._args)}
-    parts |= {f"argument {name!r}": value for name, value in process._kwargs.items()}
     whole = f"process {process.name!r}"
-    named = {f"{what} of {whole}": part for what, part in parts.items()}
+    named = getattr(process, "user_parts", None)
+    if named is None:
+        parts = {"the target": process._target}
+        parts |= {f"argument {index}": value for index, value in enumerate(process._args)}
+        parts |= {f"argument {name!r}": value for name, value in process._kwargs.items()}
+        named = {f"{what} of {whole}": part for what, part in parts.items()}
     return _name_culprit(named, whole, reason)
 
 

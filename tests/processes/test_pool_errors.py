@@ -112,6 +112,27 @@ def test_an_open_file_is_no_result(pool: Pool, tmp_path: Path, chunksize: int) -
         pool.map(open, [path] * 3, chunksize)
 
 
+@pytest.mark.parametrize(
+    ("options", "culprit"),
+    [
+        (
+            {"initializer": threading.Lock().acquire},
+            "the initializer of the pool cannot be pickled",
+        ),
+        (
+            {"initializer": print, "initargs": (1, {"log": threading.Lock()})},
+            "initargs[1] of the pool cannot be pickled (at ['log'])",
+        ),
+    ],
+)
+def test_a_part_of_an_initializer_that_does_not_pickle_is_named(
+    options: dict[str, Any], culprit: str
+) -> None:
+    with pytest.raises(UnpicklableError) as caught:
+        fiber.Pool(1, **options)
+    assert str(caught.value).startswith(culprit)
+
+
 def test_a_result_that_cannot_even_be_shown(pool: Pool) -> None:
     with pytest.raises(MaybeEncodingError, match="Unreprable object"):
         pool.apply(tasks.unreprable_result)
