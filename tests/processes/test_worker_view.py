@@ -60,6 +60,24 @@ def test_the_error_of_an_initializer_is_raised_to_a_caller_that_waits_for_worker
     pool.join()
 
 
+@pytest.mark.slow
+def test_an_initializer_that_ends_its_process_is_named() -> None:
+    with fiber.Pool(1, os._exit, (9,)) as pool, pytest.raises(StartError) as caught:
+        pool.wait_until_workers_up(PATIENCE)
+    pool.join()
+    assert "exit status 9" in str(caught.value)
+    (note,) = caught.value.__notes__
+    assert note.startswith("The pool's initializer, _exit, may have ended the process")
+
+
+@pytest.mark.slow
+def test_no_initializer_is_blamed_for_an_error_that_it_raises() -> None:
+    with fiber.Pool(1, fail) as pool, pytest.raises(StartError) as caught:
+        pool.wait_until_workers_up(PATIENCE)
+    pool.join()
+    assert not hasattr(caught.value, "__notes__")
+
+
 def test_the_first_function_decides_the_resources_of_the_workers() -> None:
     resources = WorkerResources(Resources(pool="warm"))
     resources.choose_for(fiber.meta(cpu=2)(square))

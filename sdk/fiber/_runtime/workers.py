@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Protocol
 
 from fiber import _logs, _worker_images
 from fiber._agent import worker
-from fiber._agent.interface import Cause, ChildHandle, ExitReport
+from fiber._agent.interface import OUT_OF_MEMORY, Cause, ChildHandle, ExitReport
 from fiber._agent.last_words import TELL
 from fiber._engine.activity import ChildRecord
 from fiber._engine.scheduler import PoolWorkerSet
@@ -21,6 +21,7 @@ from fiber._exceptions import fresh
 from fiber._runtime.options import PoolOptions
 from fiber._runtime.state import Runtime, SharedArguments
 from fiber._runtime.threads import BackgroundThread, Latch
+from fiber._runtime.work_items import name_of
 from fiber._transport.loop import Loop, LoopTimer, Wakeup
 from fiber._wire import work
 from fiber._wire.packet import Message
@@ -219,7 +220,19 @@ class WorkerHandle:
             text,
             killed,
             final=final if isinstance(final, FiberError) else None,
-            advice=_worker_images.advice(self._missing),
+            advice=_worker_images.advice(self._missing) or self._advice_on_initializer(report),
+        )
+
+    def _advice_on_initializer(self, report: ExitReport) -> str:
+        """Return what to do if the worker ended by itself before it was ready."""
+        initializer, *_ = self._shared.args
+        by_itself = report.cause == Cause.CHILD and not report.reason.startswith(OUT_OF_MEMORY)
+        if initializer is None or self.init_error or not by_itself:
+            return ""
+        return (
+            f"The pool's initializer, {name_of(initializer)}, may have ended the process: it runs "
+            "before a worker is ready. Look in it for os._exit() and sys.exit(), for a signal to "
+            "its own process, and for native code that crashes."
         )
 
     # Requests of its Process object
