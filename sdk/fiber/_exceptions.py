@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import sys
 from collections.abc import Callable, Mapping
 from types import BuiltinFunctionType, GetSetDescriptorType, MemberDescriptorType
@@ -35,6 +36,21 @@ def fresh(error: _E) -> _E:
 def add_note(error: BaseException, note: str) -> None:
     """Add a note, also to a frozen dataclass, whose ``add_note`` raises."""
     vars(error)["__notes__"] = [*(getattr(error, "__notes__", None) or ()), note]
+
+
+_LACKED_BY_MAIN = re.compile(r"\bmodule '__(mp_)?main__'")
+"""Text of an unpickler's error about a name that the main module lacks."""
+
+
+def advice_on_main(error: BaseException) -> str:
+    """Return what to do if a worker's main module lacks a name; empty for other errors."""
+    if type(error) is not AttributeError or not _LACKED_BY_MAIN.search(str(error)):
+        return ""
+    return (
+        "Worker processes import the main module, and do not run the lines under "
+        '`if __name__ == "__main__":`. If the function or class is defined there, move it above '
+        "that line."
+    )
 
 
 _Copies = dict[int, tuple[BaseException, BaseException]]

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import pickle
+import subprocess
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -343,3 +346,48 @@ def test_without_retries_a_failed_task_runs_once(tmp_path: Any) -> None:
             pool.apply(tasks.counted_error, (tmp_path / "c",))
         assert tasks.runs(tmp_path / "c") == 1
     pool.join()
+
+
+# The main module
+
+_GUARDED = """
+import fiber
+
+if __name__ == "__main__":
+    def square(number):
+        return number * number
+
+    class Number:
+        pass
+
+    process = fiber.Process(target=square, args=(1,))
+    process.start()
+    process.join()
+    with fiber.Pool(1) as pool:
+        for call in (
+            lambda: pool.apply(square, (1,)),
+            lambda: pool.map(square, [1]),
+            lambda: pool.map(abs, [Number()]),
+        ):
+            try:
+                call()
+            except AttributeError as error:
+                print(*error.__notes__, sep="\\n")
+"""
+
+
+def test_the_guard_of_the_main_module_is_named(backend: str, tmp_path: Path) -> None:
+    program = tmp_path / "guarded.py"
+    program.write_text(_GUARDED)
+    done = subprocess.run(
+        [sys.executable, str(program)],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        env={**os.environ, "FIBER_BACKEND": backend},
+    )
+    notes = done.stdout.splitlines()
+    assert len(notes) == 3, done.stderr
+    for text in (*notes, done.stderr):
+        assert 'do not run the lines under `if __name__ == "__main__":`' in text
+        assert text.count("move it above that line") == 1

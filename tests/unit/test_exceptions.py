@@ -14,7 +14,7 @@ from typing import Any, NoReturn
 import pytest
 
 import fiber
-from fiber._exceptions import fresh
+from fiber._exceptions import advice_on_main, fresh
 from fiber._runtime.threads import BackgroundThread
 from fiber._transport.loop import Loop
 from fiber.errors import ConnectionClosed, WorkerDied
@@ -284,3 +284,15 @@ def test_stored_exceptions_are_raised_as_copies() -> None:
         if (lines := raised_as_stored(path.read_text(encoding="utf-8")))
     }
     assert found == {}
+
+
+@pytest.mark.parametrize("module", ["__main__", "__mp_main__"])
+def test_a_name_that_the_main_module_lacks_gets_advice(module: str) -> None:
+    text = f"Can't get attribute 'f' on <module {module!r} from 'program.py'>"
+    assert "move it above that line" in advice_on_main(AttributeError(text))
+    assert not advice_on_main(ValueError(text))
+
+
+def test_other_attribute_errors_get_no_advice_on_main() -> None:
+    for text in ("Can't get attribute 'f' on <module 'my__main__' from 'it.py'>", "f", ""):
+        assert not advice_on_main(AttributeError(text))

@@ -19,6 +19,7 @@ from fiber import _logs
 from fiber._agent import last_words
 from fiber._agent.last_words import ProgressTable
 from fiber._agent.zygote_process import interpreter_arguments
+from fiber._exceptions import add_note, advice_on_main
 from fiber._hub import client as hub_client
 from fiber._hub.pipelined import finish_pipes
 from fiber._hub.protocol import HubAddress
@@ -210,6 +211,8 @@ def _load_and_run(
     except BaseException as error:
         import traceback  # rarely needed, and long to import
 
+        if advice := advice_on_main(error):
+            add_note(error, advice)
         _tell(traceback.format_exc(), missing_module(error))
         return 1
     return int(process._bootstrap(parent_sentinel=agent))

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple, cast
 
 from fiber import _worker_images
 from fiber._agent import by_reference
-from fiber._exceptions import add_note, fields_of, group_of, make, set_fields
+from fiber._exceptions import add_note, advice_on_main, fields_of, group_of, make, set_fields
 from fiber._hub.handles import collecting_grants
 
 LINKS = 8
@@ -123,7 +123,8 @@ def _received(
     if not getattr(error, "__notes__", None):
         for note in notes:
             add_note(error, note)
-    if advice := _worker_images.advice(_worker_images.missing_module(error)):
+    module = _worker_images.missing_module(error)
+    if advice := _worker_images.advice(module) or advice_on_main(error):
         add_note(error, advice)
     last = trace
     with suppress(Exception):  # the text has them in any case
