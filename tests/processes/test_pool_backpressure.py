@@ -13,7 +13,7 @@ import pytest
 import fiber
 from fiber import results
 from fiber.pool import Pool
-from processes.pool_programs import wait_until
+from processes.pool_programs import run_program, wait_until
 
 RESULT = 1 << 16
 HELD = 16 * RESULT
@@ -120,3 +120,17 @@ def test_an_iterator_that_is_dropped_keeps_no_results_and_holds_back_no_task(
     iterator = None
     wait_until(lambda: buffer.finished, "its tasks are run")
     assert not buffer.items
+
+
+def test_the_end_of_a_program_reads_no_more_than_the_buffer_of_a_map() -> None:
+    done = run_program(
+        """
+        import atexit, fiber
+        read = []
+        atexit.register(lambda: print(len(read)))  # the last of the exit functions
+        executor = fiber.Executor(1)
+        results = executor.map(abs, map(lambda n: read.append(n) or n, range(3000)), buffersize=5)
+        next(results)
+        """
+    )
+    assert done.stdout == "6\n", done.stderr
