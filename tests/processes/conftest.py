@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+import fiber
 from faults.runtime import BACKENDS, running_on
 from fiber._hub import one_way
 from processes.one_way_ends import Ends
@@ -32,3 +34,10 @@ def ends() -> Iterator[Ends]:
     yield receiver, sender
     receiver.close()
     sender.close()
+
+
+@pytest.fixture
+def manager() -> Iterator[Any]:
+    with fiber.Manager() as manager:
+        yield manager
+    manager._process.close()  # pytest holds the manager

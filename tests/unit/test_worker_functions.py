@@ -89,7 +89,7 @@ def test_the_tasks_of_a_message_share_the_copy_of_a_large_function() -> None:
         partial(math.pow, 2.0),
         partial(partial(operator.add, 1), y=("a", 2, None)),
     ],
-    ids=str,
+    ids=["function", "class", "classmethod", "builtin", "method", "partial", "nested partial"],
 )
 def test_what_cannot_change_is_unpickled_once(function: Callable[..., Any]) -> None:
     functions = known(function)
