@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import gc
 import signal
-import sys
 import threading
 from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from fiber._runtime import threads
 from fiber._runtime.threads import Latch, Waiters, acquire
 from fiber._runtime.work_items import InputStream
 from patience import PATIENCE
@@ -263,6 +264,6 @@ def asleep(thread: threading.Thread) -> bool:
 
 def test_a_wait_while_the_interpreter_ends_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     # The thread that would set the latch does not run any more then.
-    monkeypatch.setattr(sys, "is_finalizing", lambda: True)
+    monkeypatch.setattr(threads, "sys", SimpleNamespace(is_finalizing=lambda: True))
     with pytest.raises(RuntimeError, match="the interpreter is ending"):
         Latch().wait()
