@@ -263,7 +263,7 @@ def asleep(thread: threading.Thread) -> bool:
 
 
 def test_a_wait_while_the_interpreter_ends_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    # The thread that would set the latch does not run any more then.
+    # By then the interpreter has stopped the thread that would set the latch.
     monkeypatch.setattr(threads, "sys", SimpleNamespace(is_finalizing=lambda: True))
     with pytest.raises(RuntimeError, match="the interpreter is ending"):
         Latch().wait()

@@ -28,6 +28,7 @@ from types import (
 from typing import Any, cast
 
 from fiber._agent.by_value import FUNCTIONS
+from fiber._wire import work
 from fiber._wire.memory_files import BytesLike
 
 Function = Callable[..., Any]
@@ -40,7 +41,7 @@ _DEFINITIONS = (FunctionType, MethodDescriptorType, WrapperDescriptorType, type)
 _SHARING = ("fiber", "multiprocessing.managers")
 """Modules, or packages, of the classes whose objects stand for something shared."""
 
-_CONSTANTS = frozenset({bool, bytes, complex, float, int, range, str, type(None), type(...)})
+_CONSTANTS = work.PLAIN | {range, type(...)}
 
 
 class KnownFunctions:

@@ -37,6 +37,9 @@ SMALL = frozenset({int, float, bool, type(None)})
 
 _Function = Callable[..., Any]
 
+_REPLIED = object()
+"""Marker in place of a function: a reply to the batch was sent already."""
+
 _OURS = frozenset({__file__, functions.__file__})
 """Files whose frames are between this loop and the task."""
 
@@ -126,8 +129,12 @@ class BatchRunner:
             taken: Taken = []
             function: Any = _Caller(buffers, taken)
         else:
-            if not self._knows_function(seq, head, body, buffers):
+            loading = time.perf_counter()
+            function = self._function(seq, head, body, buffers)
+            if function is _REPLIED:
                 return
+            # A function that takes long to unpickle must not pass for slow tasks.
+            started += time.perf_counter() - loading
             pickled = body if head.size == work.BESIDE else body[head.size :]
             try:
                 items, taken = loads(*work.take_beside(pickled or None, buffers[head.buffers :]))
@@ -135,15 +142,6 @@ class BatchRunner:
                 self._reply(work.UNREADABLE, seq, encode_error(error))
                 return
             buffers.clear()
-            eager = not head.stride
-            loading = time.perf_counter()
-            try:
-                function = self._functions.get(head.function, head.unit, eager=eager)
-            except BaseException as error:
-                self._reply(work.BROKEN, seq, encode_error(error))
-                return
-            # A function that takes long to unpickle must not pass for slow tasks.
-            started += time.perf_counter() - loading
         batch = self._start(seq, items, started, taken, eager=not head.stride)
         del items  # the iterator frees the items at its end
         self._note(seq)
@@ -205,22 +203,22 @@ class BatchRunner:
         progress[1] = 0
         progress[0] = seq
 
-    def _knows_function(
+    def _function(
         self, seq: int, head: work.Head, body: memoryview, buffers: list[memoryview]
-    ) -> bool:
-        """Return whether the function of a batch is known now; if not, reply so."""
-        if not head.size:
-            if head.function not in self._functions:
-                self._reply(work.UNKNOWN, seq)
-                return False
-            return True
-        inline = None if head.size == work.BESIDE else body[: head.size]
+    ) -> Any:
+        """Return the function of a batch, or _REPLIED."""
+        known = self._functions
+        if not head.size and head.function not in known:
+            self._reply(work.UNKNOWN, seq)
+            return _REPLIED
         try:
-            self._functions.learn(head.function, *work.take_beside(inline, buffers[: head.buffers]))
+            if head.size:
+                inline = None if head.size == work.BESIDE else body[: head.size]
+                known.learn(head.function, *work.take_beside(inline, buffers[: head.buffers]))
+            return known.get(head.function, head.unit, eager=not head.stride)
         except BaseException as error:
             self._reply(work.BROKEN, seq, encode_error(error))
-            return False
-        return True
+            return _REPLIED
 
     def _reply(self, *words: Any) -> None:
         self._channel.send(pickle.dumps(words))

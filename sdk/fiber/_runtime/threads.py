@@ -207,9 +207,7 @@ def check_may_wait() -> None:
     A loop thread would wait for itself.  While the interpreter ends, the loop thread is stopped.
     """
     if sys.is_finalizing():
-        raise RuntimeError(
-            "the interpreter is ending, and Fiber's own thread does not run any more"
-        )
+        raise RuntimeError("the interpreter is ending, and has stopped Fiber's own thread")
     if loop.runs_here():
         raise RuntimeError(
             "a finalizer cannot wait for a result here: the garbage collector runs it on Fiber's "
