@@ -41,7 +41,11 @@ class Wire:
         self.held = deque()
 
     def let_go(self) -> None:
-        """Deliver the held frames."""
+        """Deliver the held frames, before any later one."""
+        self._loop.call_soon(self._release)
+
+    def _release(self) -> None:
+        # On the loop thread, as ``send``: a frame that is sent meanwhile would overtake these.
         held, self.held = self.held or deque(), None
         for encoded in held:
             self._loop.call_soon(self._deliver, encoded)
