@@ -102,25 +102,22 @@ def test_killed_while_it_gets_large_arguments() -> None:
 
 
 def test_ten_thousand_queued_and_workers_dying_all_the_time() -> None:
-    rng, done = random.Random(1), threading.Event()
+    """Each map that ends kills a worker, so one becomes ready between the kills on any machine."""
+    rng, count = random.Random(1), 50
     with fiber.Pool(3, retries=1000) as pool:
+
+        def kill_any(_: list[int]) -> None:
+            kill_one(pool, rng.choice)
+
         works(pool)
-
-        def kill_now_and_then() -> None:
-            while not done.wait(0.05):
-                kill_one(pool, rng.choice)
-
-        killer = threading.Thread(target=kill_now_and_then)
-        killer.start()
-        try:
-            results: list[ApplyResult[Any]] = []
-            results += [pool.map_async(abs, range(-5000, 0), chunksize=7)]
-            results += [pool.apply_async(abs, (-n,)) for n in range(5000)]
-            seen = [result.get(PATIENCE) for result in results]
-        finally:
-            done.set()
-            killer.join()
-    assert seen == [list(range(5000, 0, -1)), *range(5000)]
+        maps: list[ApplyResult[list[int]]] = []
+        calls: list[ApplyResult[int]] = []
+        for n in range(0, 5000, count):
+            maps += [pool.map_async(abs, range(-n - count, -n), chunksize=7, callback=kill_any)]
+            calls += [pool.apply_async(abs, (-m,)) for m in range(n, n + count)]
+        assert [result.get(PATIENCE) for result in calls] == list(range(5000))
+        mapped = [result.get(PATIENCE) for result in maps]
+    assert mapped == [list(range(n + count, n, -1)) for n in range(0, 5000, count)]
 
 
 def test_callbacks_come_once_however_workers_die() -> None:
