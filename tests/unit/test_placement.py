@@ -153,8 +153,10 @@ def test_counts_are_those_of_a_recount_whatever_happens() -> None:
 # How many agents are wanted
 
 
-def demand(placement: Placement[str, str], maximum: int = 1000) -> Demand:
-    return Demand(placement, maximum=maximum, idle_timeout=IDLE)
+def demand(
+    placement: Placement[str, str], maximum: int = 1000, idle_timeout: float = IDLE
+) -> Demand:
+    return Demand(placement, maximum=maximum, idle_timeout=idle_timeout)
 
 
 def test_the_demand_has_room_for_all_waiting_children() -> None:
@@ -201,15 +203,18 @@ def test_a_worker_that_is_started_again_does_not_change_the_demand() -> None:
     assert wanted.decide(now=1.1).agents == 2
 
 
-def test_agents_that_have_not_joined_are_given_up_after_a_time_without_waiting_children() -> None:
+@pytest.mark.parametrize(("idle_timeout", "linger"), [(IDLE, LINGER), (LINGER / 2, LINGER / 2)])
+def test_agents_that_have_not_joined_are_given_up_after_a_time_without_waiting_children(
+    idle_timeout: float, linger: float
+) -> None:
     placement = with_agents(slots=1)
-    wanted = demand(placement)
+    wanted = demand(placement, idle_timeout=idle_timeout)
     put(placement, *"123")
     assert wanted.decide(now=0).agents == 3
     for child in "123":
         placement.leave(child)
     assert wanted.decide(now=1).agents == 3
-    assert wanted.decide(now=1 + LINGER).agents == 0
+    assert wanted.decide(now=1 + linger).agents == 0
 
 
 def test_agents_of_the_floor_stay_and_are_not_part_of_the_demand() -> None:

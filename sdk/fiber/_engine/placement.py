@@ -14,9 +14,10 @@ Agent = TypeVar("Agent", bound=Hashable)
 Child = TypeVar("Child", bound=Hashable)
 
 
-LINGER = 2.0
-"""Seconds for which agents that have not joined stay wanted once no child needs them.  Soon a pool
-may replace a worker that died, or the program may start its next pool."""
+LINGER = 10.0
+"""Seconds for which agents that have not joined stay wanted once no child needs them: about as long
+as a pod takes to join.  Soon a pool may replace a worker that died, or the program may start its
+next pool.  An ``idle_timeout`` below it counts instead."""
 
 
 class Placement(Generic[Agent, Child]):
@@ -172,6 +173,7 @@ class Demand:
         self.maximum = maximum
         self._placement = placement
         self._idle_timeout = idle_timeout
+        self._linger = min(LINGER, idle_timeout)
         self._retiring: set[Any] = set()
         self._wanted = 0
         self._less_since: float | None = None
@@ -199,11 +201,12 @@ class Demand:
         lacking = max(len(placement.waiting) - placement.room, 0)
         needed = min(used + math.ceil(lacking / placement.slots), max(self.maximum, used))
         kept = self._wanted - released
-        if needed >= kept or (self._less_since is not None and now >= self._less_since + LINGER):
+        since = self._less_since
+        if needed >= kept or (since is not None and now >= since + self._linger):
             self._wanted, self._less_since = needed, None
         else:
             self._wanted = kept
-            self._less_since = now if self._less_since is None else self._less_since
+            self._less_since = now if since is None else since
         return self._wanted
 
     def _release_retired(self) -> list[Any]:
@@ -221,7 +224,7 @@ class Demand:
         )
 
     def _wake_at(self, spared: int) -> float:
-        """Return when to ask again: when the next idle agent is due, or LINGER is over."""
+        """Return when to ask again: when the next idle agent is due, or the linger is over."""
         oldest = next(itertools.islice(self._placement.idle.values(), spared, None), math.inf)
         due = oldest + self._idle_timeout
-        return due if self._less_since is None else min(due, self._less_since + LINGER)
+        return due if self._less_since is None else min(due, self._less_since + self._linger)
