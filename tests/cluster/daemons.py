@@ -2,7 +2,8 @@
 
 What is needed to start one again is kept beside its process, so that a test can stop it and another
 command can bring it back. Each is the child of a shell that waits for it and writes down how it
-ended, since nobody else will be there to be told.
+ended, since nobody else will be there to be told. Once the cluster is up, that shell also starts a
+daemon again that ends by itself, as the supervisors of other clusters do.
 """
 
 from __future__ import annotations
@@ -20,12 +21,16 @@ from cluster.shell import ClusterError, wait_for
 
 _SYSTEM_PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 _QUOTED = 15
+_ENDED = "fiber-cluster: this daemon has ended by itself"
 # $0 is the record: what the kernel says of this shell, and what it has counted up to now. It is
 # there before the standard output is closed, which is what the starter waits for.
 _KEEPER = (
     'cat "/proc/$$/stat" /proc/vmstat > "$0.new" && mv "$0.new" "$0" && exec >&2 || exit\n'
-    '"$@"\n'
-    'echo $? > "$0.status"'
+    "while :; do\n"
+    '"$@"; echo $? > "$0.status"; [ -e "$0.kept" ] || exit\n'
+    f'echo "{_ENDED}, with status $(cat "$0.status"), and is started again"\n'
+    "sleep 1\n"
+    "done"
 )
 
 
@@ -38,6 +43,7 @@ class Daemon:
         self._command_file = places.STATE / "daemons" / f"{name}.json"
         self._record = places.STATE / "daemons" / f"{name}.process"
         self._status_file = places.STATE / "daemons" / f"{name}.process.status"
+        self._kept_file = places.STATE / "daemons" / f"{name}.process.kept"
 
     def start(self, *command: str | Path, namespace: str = "") -> None:
         """Start it with this command in a network namespace; do nothing if it runs."""
@@ -55,6 +61,10 @@ class Daemon:
         """Start it with the command that it had; do nothing if it runs."""
         if not self.runs():
             self._spawn(self.command)
+
+    def keep(self) -> None:
+        """From now on, start it again whenever it ends by itself."""
+        self._kept_file.touch()
 
     @property
     def command(self) -> list[str]:
@@ -123,13 +133,22 @@ class Daemon:
 
     def last_words(self) -> str:
         """The end of its log."""
-        try:
-            lines = self.log.read_text(errors="replace").splitlines()[-_QUOTED:]
-        except OSError:
-            lines = []
+        lines = self._lines()[-_QUOTED:]
         if not lines:
             return f"its log, {self.log}, is empty"
         return "\n".join([f"the end of its log, {self.log}:", *lines])
+
+    def ends(self) -> list[str]:
+        """Each time that it ended by itself and was started again: the last lines of its log."""
+        lines = self._lines()
+        ends = [number for number, line in enumerate(lines) if line.startswith(_ENDED)]
+        return ["\n".join(lines[max(end - _QUOTED, 0) : end + 1]) for end in ends]
+
+    def _lines(self) -> list[str]:
+        try:
+            return self.log.read_text(errors="replace").splitlines()
+        except OSError:
+            return []
 
 
 def all_daemons() -> list[Daemon]:

@@ -28,6 +28,11 @@ def _end(daemon: Daemon) -> str:
     return "\n".join([*said, *_shortages(), _AGAIN])
 
 
+def ends_meanwhile(daemons: Iterable[Daemon]) -> str:
+    """Return the last words of those that ended by themselves and were started again."""
+    return "\n\n".join(f"{daemon.name}:\n{end}" for daemon in daemons for end in daemon.ends())
+
+
 def silence_of(daemons: Iterable[Daemon], answer: str) -> str:
     """Return the diagnosis if these run and the awaited condition does not come.
 

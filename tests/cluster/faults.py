@@ -69,8 +69,8 @@ def start(name: str) -> None:
 @contextmanager
 def stopped(name: str) -> Iterator[None]:
     """The daemon does not run meanwhile."""
-    stop(name)
     try:
+        stop(name)
         yield
     finally:
         start(name)

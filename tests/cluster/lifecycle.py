@@ -128,6 +128,8 @@ def _start(count: int) -> None:
         complaint=lambda: diagnosis.end_of(all_daemons()),
         account=lambda: diagnosis.silence_of(_kubelets(count), answer_of("get", "nodes", *_WHY)),
     )
+    for daemon in all_daemons():
+        daemon.keep()
 
 
 def _kubelets(count: int) -> list[Daemon]:

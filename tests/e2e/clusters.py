@@ -27,6 +27,7 @@ from cluster import (
     ability,
     build,
     control_plane,
+    diagnosis,
     fake_nodes,
     faults,
     images,
@@ -35,6 +36,7 @@ from cluster import (
     places,
 )
 from cluster.ability import Choice
+from cluster.daemons import all_daemons
 from cluster.filters import Allowed
 from cluster.images import Image
 from cluster.laptop import Laptop
@@ -97,6 +99,10 @@ class Cluster:
         with self._without_apiserver():
             yield
         self.kubectl("get", "--raw", "/readyz")
+
+    def trouble(self) -> str:
+        """Return what went wrong in the cluster by itself; empty if nothing did."""
+        return ""
 
     def kill(self, pod: Mapping[str, Any], container: str) -> None:
         """SIGKILL to a container of the pod, which is a document of the API.
@@ -186,6 +192,9 @@ class Own(Cluster):
 
     def _without_apiserver(self) -> AbstractContextManager[None]:
         return faults.stopped(faults.APISERVER)
+
+    def trouble(self) -> str:
+        return diagnosis.ends_meanwhile(all_daemons())
 
     def bring(self, image: Image) -> str:
         return images.bring(image)

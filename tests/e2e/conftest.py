@@ -27,6 +27,7 @@ LABEL = "fiber.dev/e2e"
 LIMIT = 120
 _NO_CLUSTER = pytest.StashKey[str]()
 _RELEASE = pytest.StashKey[Release]()
+_TROUBLE = pytest.StashKey[str]()
 
 MakeScene = Callable[[str], AbstractContextManager[Scene]]
 
@@ -52,6 +53,7 @@ def cluster(pytestconfig: pytest.Config) -> Iterator[Cluster]:
             pytest.fail(f"CI=true, and {error}", pytrace=False)
         pytest.skip(str(error))
     yield chosen
+    pytestconfig.stash[_TROUBLE] = chosen.trouble()
     chosen.close()
 
 
@@ -202,6 +204,9 @@ def pytest_terminal_summary(
         terminalreporter.section("seconds from an event to what follows")
         for line in report():
             terminalreporter.line(line)
+    if trouble := config.stash.get(_TROUBLE, ""):
+        terminalreporter.section("daemons of the cluster that ended by themselves")
+        terminalreporter.line(trouble)
     reason = config.stash.get(_NO_CLUSTER, None)
     if reason is not None:
         terminalreporter.section("NO END-TO-END TEST HAS RUN", red=True, bold=True)

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import TracebackType
 
 from e2e.program import Programs
 from e2e.scene import Scene
@@ -53,6 +54,20 @@ if __name__ == "__main__":
 """
 
 
+class Command(subprocess.Popen[str]):
+    """Command that runs.  A test that fails kills it: to wait for its end would hide the error."""
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if kind is not None:
+            self.kill()
+        super().__exit__(kind, error, trace)
+
+
 class Person:
     """A person with a kubeconfig, who may run programs in one namespace."""
 
@@ -78,8 +93,8 @@ class Person:
         (folder / "wait.py").write_text(WAIT, encoding="utf-8")
         (folder / "hang.py").write_text(HANG, encoding="utf-8")
 
-    def start(self, *words: str, **variables: str) -> subprocess.Popen[str]:
-        return subprocess.Popen(
+    def start(self, *words: str, **variables: str) -> Command:
+        return Command(
             [self._fiber, *words],
             cwd=self.folder,
             env={**self._environment, **variables},

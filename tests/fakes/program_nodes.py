@@ -290,10 +290,11 @@ def _namespace(pods: list[Body], name: str) -> str:
 
 
 def kill(launched: Launched) -> None:
-    """Kill a launcher, if it runs, and its program."""
+    """Kill a launcher and its program, if the launcher runs; else its number may be another's."""
+    if launched.process.poll() is not None:
+        return
     children = list(_children(launched.process.pid))
-    if launched.process.poll() is None:
-        launched.process.kill()
+    launched.process.kill()
     for child in children:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(child, signal.SIGKILL)

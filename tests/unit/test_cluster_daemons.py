@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import re
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -46,6 +48,27 @@ def test_a_daemon_is_started_once_found_again_and_killed() -> None:
     Daemon("sleeper").start_again()
     assert daemon.runs()
     assert pid_of(daemon) != pid
+
+
+def test_a_daemon_that_is_kept_is_started_again_when_it_ends_by_itself() -> None:
+    daemon = Daemon("shell")
+    daemon.start("sh", "-c", "echo here I am $$; exec sleep 300.0625")
+    daemon.keep()
+
+    def said() -> list[str]:
+        return re.findall("here I am ([0-9]+)", daemon.log.read_text())
+
+    wait_for("its first words", lambda: len(said()) == 1, seconds=PATIENCE)
+    assert diagnosis.ends_meanwhile(all_daemons()) == ""
+    os.kill(int(said()[0]), signal.SIGKILL)
+    wait_for("its next words", lambda: len(said()) == 2, seconds=PATIENCE)
+    assert daemon.runs()
+    (end,) = daemon.ends()
+    assert end.startswith("here I am ")
+    assert "with status 137, and is started again" in end
+    assert diagnosis.ends_meanwhile(all_daemons()) == f"shell:\n{end}"
+    daemon.kill()
+    assert not daemon.runs()
 
 
 def test_a_daemon_inherits_no_variable() -> None:
