@@ -36,7 +36,7 @@ class Node:
 
     def _start_containerd(self) -> None:
         (self._files / "cni").mkdir(parents=True, exist_ok=True)
-        self._write("cni/10-bridge.conflist", _pod_network(self.index, self._data))
+        self.write("cni/10-bridge.conflist", _pod_network(self.index, self._data))
         settings = self._files / "containerd.toml"
         settings.write_text(self.containerd_settings())
         self._containerd.socket.parent.mkdir(parents=True, exist_ok=True)
@@ -57,7 +57,7 @@ class Node:
             f"{self.name}-serving", self.name, addresses=f"IP:{address},DNS:{self.name}"
         )
         cgroups.make(places.namespace(self.index))
-        settings = self._write("kubelet.yaml", self.kubelet_settings(serving))
+        settings = self.write("kubelet.yaml", self.kubelet_settings(serving))
         user = f"system:node:{self.name}"
         self._start(
             "kubelet",
@@ -82,15 +82,17 @@ class Node:
             "healthzBindAddress": "127.0.0.1:10256",
             "metricsBindAddress": "127.0.0.1:10249",
         }
-        self._start("proxy", "kube-proxy", f"--config={self._write('proxy.yaml', settings)}")
+        self._start("proxy", "kube-proxy", f"--config={self.write('proxy.yaml', settings)}")
 
     def _start(self, part: str, *command: str | Path) -> None:
         daemon = Daemon(f"{self.name}-{part}")
         daemon.start(*command, namespace=places.namespace(self.index))
 
-    def _write(self, name: str, settings: dict[str, Any]) -> Path:
-        file = self._files / name
-        file.write_text(json.dumps(settings, indent=2))
+    def write(self, name: str, settings: dict[str, Any]) -> Path:
+        """Write settings that have changed; kube-proxy ends whenever its file is written."""
+        file, text = self._files / name, json.dumps(settings, indent=2)
+        if not file.exists() or file.read_text() != text:
+            file.write_text(text)
         return file
 
     def containerd_settings(self) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -131,6 +132,18 @@ class PaperPki(Pki):
 
     def __init__(self, folder: Path) -> None:
         self.authority = Pair(folder / "ca.crt", folder / "ca.key")
+
+
+def test_settings_that_are_the_same_are_not_written_again(tmp_path: Path) -> None:
+    node = Node(1, PaperPki(tmp_path))
+    (places.STATE / "conf" / "node-1").mkdir(parents=True)
+    file = node.write("proxy.yaml", {"mode": "iptables"})
+    os.utime(file, (0, 0))
+    node.write("proxy.yaml", {"mode": "iptables"})
+    assert file.stat().st_mtime == 0
+    node.write("proxy.yaml", {"mode": "nftables"})
+    assert file.stat().st_mtime > 0
+    assert "nftables" in file.read_text()
 
 
 def test_nodes_share_no_folder_of_containerd(tmp_path: Path) -> None:
