@@ -109,6 +109,21 @@ def test_a_fault_is_a_command(
     assert asked == ["node-1"]
 
 
+def test_a_daemon_that_could_not_be_stopped_in_good_order_is_started_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[str] = []
+
+    def fails(_: str) -> None:
+        raise ClusterError("it does not end")
+
+    monkeypatch.setattr(faults, "stop", fails)
+    monkeypatch.setattr(faults, "start", asked.append)
+    with pytest.raises(ClusterError, match="it does not end"), faults.stopped("apiserver"):
+        pass
+    assert asked == ["apiserver"]
+
+
 def test_an_error_is_a_sentence_and_not_a_traceback() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "cluster", "cut", "node-99"],
