@@ -129,28 +129,40 @@ def test_a_warm_agent_waits_longer_than_its_grace_for_its_first_master(pool: Poo
     assert pool.master().line() == "joined warm-0"
 
 
-def sockets_and_pipes(program: Program) -> set[str]:
-    """Return the sockets and pipes that a program has open, without its standard streams."""
-    found = set()
-    for descriptor in Path(f"/proc/{program.pid}/fd").iterdir():
-        with contextlib.suppress(FileNotFoundError):  # it was closed meanwhile
-            if int(descriptor.name) > 2:
-                found.add(os.readlink(descriptor))
-    return {name for name in found if name.startswith(("socket:", "pipe:"))}
+def descriptors(program: Program) -> list[str]:
+    """Return what a program has open, without its standard streams, once a connection is made.
+
+    Until then it has nng's pipe not yet, or two descriptors of the socket.
+    """
+    found: list[str] = []
+
+    def is_made() -> bool:
+        found.clear()
+        for descriptor in Path(f"/proc/{program.pid}/fd").iterdir():
+            with contextlib.suppress(FileNotFoundError):  # it was closed meanwhile
+                if int(descriptor.name) > 2:
+                    found.append(os.readlink(descriptor))
+        sockets = [name for name in found if name.startswith("socket:")]
+        return len(sockets) == len(set(sockets)) and any(name.startswith("pipe:") for name in found)
+
+    wait_for(is_made, what="a connection that is made")
+    return found
 
 
 def test_an_agent_serves_one_master_after_the_other_and_keeps_no_state(pool: Pool) -> None:
     agent = pool.agent(grace=30)
-    before: set[str] = set()
+    numbers, before = [], set[str]()
     for _ in range(3):
         master = pool.master()
         assert master.line() == "joined warm-0"
-        now = sockets_and_pipes(agent)
-        assert now
-        assert now.isdisjoint(before)
-        before = now
+        now = descriptors(agent)
+        numbers.append(len(now))
+        own = {name for name in now if name.startswith(("socket:", "pipe:"))}
+        assert own.isdisjoint(before)
+        before = own
         master.signal(signal.SIGTERM)
         assert master.wait() == 0
+    assert len(set(numbers)) == 1
     # A master that is on its way out refuses newcomers.
     assert set(agent.stderr.splitlines()) <= {
         f"fiber agent warm-0: the master at {pool.address} refused this agent: "
