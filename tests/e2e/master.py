@@ -147,7 +147,8 @@ class Agent:
 
     def _tell_when_welcomed(self) -> None:
         statistics = self._link.statistics()
-        if statistics.frames_sent and not statistics.unacknowledged_datagrams:
+        waits = statistics.queued_frames or statistics.unacknowledged_datagrams
+        if statistics.frames_sent and not waits:
             self._say("welcomed", name=self._name)
         else:
             self._loop.call_later(0.01, self._tell_when_welcomed)

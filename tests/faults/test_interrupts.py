@@ -31,8 +31,8 @@ SCRIPT = """
         child = fiber.Process(target=targets.block)
         child.start()
         {prepare}
-        print("ready", flush=True)
         try:
+            print("ready", flush=True)
             {call}
         except KeyboardInterrupt:
             print("interrupted", flush=True)
@@ -203,8 +203,8 @@ CAUGHT = """
         child = fiber.Process(target=targets.echo, args=(theirs,))
         child.start()
         theirs.close()
-        print("ready", flush=True)
         try:
+            print("ready", flush=True)
             ours.recv()
         except KeyboardInterrupt:
             print("interrupted", flush=True)

@@ -50,12 +50,13 @@ MASTER = """
         tell(link)
 
     def tell(link):
-        # Once it has acknowledged something, it knows that it was welcome.
+        # Once it has acknowledged the message, it knows that it was welcome.  The loop sends later.
         statistics = link.statistics()
-        if statistics.queued_frames or statistics.unacknowledged_datagrams:
-            loop.call_later(0.01, tell, link)
-        else:
+        waits = statistics.queued_frames or statistics.unacknowledged_datagrams
+        if statistics.frames_sent and not waits:
             print("joined", link.peer.name, flush=True)
+        else:
+            loop.call_later(0.01, tell, link)
 
     def end(*_):
         def act():

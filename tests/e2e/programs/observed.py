@@ -34,8 +34,8 @@ def main() -> None:
         results = [pool.apply_async(linger, (number, begun)) for number in range(2)]
         for _ in results:
             begun.get()
-        print(json.dumps({"event": "waiting", "total": total}), flush=True)
         with contextlib.suppress(KeyboardInterrupt):
+            print(json.dumps({"event": "waiting", "total": total}), flush=True)
             for result in results:
                 result.wait()
             if "--stay" in sys.argv:
