@@ -159,8 +159,8 @@ class Ring(Generic[_T]):
                 member = Member(rank, self.size, to_next, from_previous, channels[rank][1])
                 work = with_resources(self._work, self._wishes)
                 process = Process(target=work, args=(member,), name=f"RingMember-{rank}")
+                processes.append(process)  # first, as an interrupt may follow the start at once
                 process.start()
-                processes.append(process)
             _close([end for link in links for end in link])
             _close([of_member for _, of_member in channels])
             results = _await_all([of_program for of_program, _ in channels])
@@ -168,7 +168,7 @@ class Ring(Generic[_T]):
             return results
         finally:
             try:
-                _end(processes, kill=not ended)
+                _end([process for process in processes if process._popen], kill=not ended)
             finally:
                 _close([end for pair in (*links, *channels) for end in pair])
 

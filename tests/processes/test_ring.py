@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 import fiber
+from fiber import connection
 from fiber.errors import MemberLost
 from patience import PATIENCE
 
@@ -102,7 +103,10 @@ class Losing:
         return {int(path.name): path.read_text() for path in self.folder.iterdir()}
 
 
-def test_all_members_learn_of_a_killed_member(tmp_path: Path) -> None:
+def test_all_members_learn_of_a_killed_member(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connection, "_NEWS", PATIENCE)
     losing = Losing("kill", tmp_path)
     with pytest.raises(MemberLost, match=r"member 1 of the ring is lost: .*SIGKILL") as caught:
         fiber.Ring(4, losing).run()
@@ -215,6 +219,21 @@ def test_an_interrupt_ends_all(tmp_path: Path) -> None:
     parent = os.getpid()
     with pytest.raises(KeyboardInterrupt):
         fiber.Ring(2, interrupt).run()
+    assert not fiber.active_children()
+
+
+def test_an_interrupt_just_after_the_start_of_a_member_ends_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    start = fiber.Process.start
+
+    def interrupted(process: fiber.Process) -> None:
+        start(process)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(fiber.Process, "start", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        fiber.Ring(2, lambda rank, size: time.sleep(4 * PATIENCE)).run()
     assert not fiber.active_children()
 
 
