@@ -30,6 +30,7 @@ TESTS = Path(__file__).resolve().parents[1]
 WORKER = (sys.executable, "-m", "conformance.cpython_suite.worker")
 MARKER = "CONFORMANCE_GROUP"
 TRACKER = "multiprocessing.resource_tracker import main"
+START_LIMIT = 60.0  # seconds for an interpreter to begin its first, or its next, test
 EXIT_LIMIT = 10.0  # seconds for an interpreter to end after its last test
 GONE_LIMIT = 5.0  # seconds for the processes of an ended interpreter to be gone
 TAIL = 6000  # characters of output kept for a failure
@@ -183,18 +184,24 @@ class _Interpreter:
         with selectors.DefaultSelector() as selector, _pidfd(process.pid) as ended:
             selector.register(reports, selectors.EVENT_READ)
             selector.register(ended, selectors.EVENT_READ)
-            deadline = time.monotonic() + self.target.limit
+            deadline = time.monotonic() + self._limit()
             while True:
                 ready = {key.fd for key, _ in selector.select(deadline - time.monotonic())}
                 if reports in ready:
                     if not self._read(reports):
                         selector.unregister(reports)
-                    deadline = time.monotonic() + (EXIT_LIMIT if self.done else self.target.limit)
+                    deadline = time.monotonic() + self._limit()
                 elif ended in ready:
                     process.wait()
                     return True
                 elif time.monotonic() >= deadline:
                     return False
+
+    def _limit(self) -> float:
+        """Return the seconds until the next report must come."""
+        if self.done:
+            return EXIT_LIMIT
+        return self.target.limit if self.current else START_LIMIT
 
     def _read(self, reports: int) -> bool:
         chunk = os.read(reports, 1 << 16)

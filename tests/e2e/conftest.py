@@ -87,7 +87,7 @@ def release(
     _remove_namespaces(kube)
     release.uninstall()  # left by a session that was killed, perhaps while Helm ran
     # The namespace may still be terminating after the last session, and then accepts no objects.
-    kube.kubectl("delete", "namespace", RELEASE, "--ignore-not-found", "--timeout=120s")
+    kube.delete_namespaces(RELEASE)
     release.install()
     pytestconfig.stash[_RELEASE] = release
     yield release
@@ -218,4 +218,4 @@ def _short(name: str) -> str:
 
 
 def _remove_namespaces(kube: Kube) -> None:
-    kube.kubectl("delete", "namespaces", "--selector", f"{LABEL}=true", "--timeout=120s")
+    kube.delete_namespaces("--selector", f"{LABEL}=true")

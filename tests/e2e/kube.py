@@ -102,9 +102,16 @@ class Kube:
         self._proxy.kill()
         self._proxy.communicate()
 
-    def kubectl(self, *arguments: str, stdin: str = "") -> str:
+    def kubectl(self, *arguments: str, stdin: str = "", seconds: float = _PATIENCE) -> str:
         """Return kubectl's output."""
-        return run(self._kubectl, "--kubeconfig", self.kubeconfig, *arguments, stdin=stdin)
+        login = ("--kubeconfig", self.kubeconfig)
+        return run(self._kubectl, *login, *arguments, stdin=stdin, seconds=seconds)
+
+    def delete_namespaces(self, *which: str) -> None:
+        """Delete the namespaces, and wait until they are gone."""
+        self.kubectl(
+            "delete", "namespaces", *which, "--ignore-not-found", "--timeout=120s", seconds=180
+        )
 
     def apply(self, manifest: Body, *arguments: str) -> str:
         """``kubectl apply -f``."""

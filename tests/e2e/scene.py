@@ -92,12 +92,18 @@ class Scene:
         raise AssertionError(f"it must not be so: {what}")
 
     def first(self, resource: str, condition: Callable[[Body], object]) -> float:
-        """Return when an object was first seen for which the condition is true."""
-        return next(
-            moment.at
-            for moment in list(self.moments)
-            if moment.resource == resource and not moment.gone and condition(moment.object)
-        )
+        """Return when an object was first seen for which the condition is true.
+
+        Wait for that: what one watch shows may come before what another one does.
+        """
+
+        def seen() -> Moment | None:
+            there = (moment for moment in self.moments if moment.resource == resource)
+            return next((m for m in there if not m.gone and condition(m.object)), None)
+
+        moment = self.wait(f"{resource}: it is seen", seen)
+        assert moment is not None
+        return moment.at
 
     def most_at_once(self, condition: Callable[[Body], object]) -> int:
         """The largest number of pods that there ever were at a time with this condition true."""

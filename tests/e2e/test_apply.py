@@ -77,8 +77,8 @@ def test_a_deleted_pool_takes_everything_along(pool: Pool, agent: Body) -> None:
     pool.kubectl("delete", "fiberpool", "es")
     scene.wait("no pod is left", lambda: not scene.now["pods"])
     scene.wait("no endpoint is left", lambda: not scene.now["endpointslices"])
-    assert not scene.kube.get(secret)
-    assert not scene.kube.get(service)
+    scene.wait("no Secret is left", lambda: not scene.kube.get(secret), poll=0.5)
+    scene.wait("no Service is left", lambda: not scene.kube.get(service), poll=0.5)
 
 
 def test_kubectl_scales_a_warm_pool_between_its_bounds(pool: Pool, agent: Body) -> None:
@@ -180,9 +180,9 @@ def test_an_evicted_worker_is_replaced(pool: Pool, agent: Body) -> None:
     (victim,) = pool.ready(1)
     scene.kube.create(scene.path("pods", victim, "eviction"), {"metadata": {"name": victim}})
     pool.wait("another", lambda: pool.ever - {victim})
+    pool.wait("it is counted", lambda: pool.status.get("failures", {}).get("disrupted") == 1)
     pool.ready(1)
-    failures = pool.status["failures"]
-    assert (failures["disrupted"], failures.get("total", 0)) == (1, 0)
+    assert pool.status["failures"].get("total", 0) == 0
 
 
 def test_kubectl_explains_the_fields(release: Release, kube: Kube) -> None:

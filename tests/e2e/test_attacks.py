@@ -85,10 +85,10 @@ def test_a_neighbour_changes_and_deletes_the_pool_of_a_program(
     programs: Programs, scene: Scene, tmp_path: Path
 ) -> None:
     """A known limit: the role fiber-user is for one namespace, not for one pool."""
+    config = kubeconfig_of(scene, tmp_path)
     program = programs.start("outside", "mapping.py", "--tasks", 100, "--seconds", 0.2)
     program.says("first")
     (pool,) = scene.now["fiberpools"]
-    config = kubeconfig_of(scene, tmp_path)
     neighbour = (find_program("kubectl"), "--kubeconfig", config, "--namespace", scene.namespace)
     change = json.dumps({"spec": {"template": {"metadata": {"labels": {"from": "neighbour"}}}}})
     run(*neighbour, "patch", "fiberpool", pool, "--type=merge", "--patch", change)

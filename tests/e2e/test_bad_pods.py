@@ -5,6 +5,7 @@ All the pools are made at once, as most of the time is the kubelet's; each test 
 
 from __future__ import annotations
 
+import datetime
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -13,7 +14,7 @@ import yaml
 
 from e2e.delays import record
 from e2e.kube import Body
-from e2e.pools import Pool, has_ended, says, template, waits_for
+from e2e.pools import Pool, has_ended, says, state_of, template, waits_for
 from e2e.scene import Scene
 
 Pools = Mapping[str, Pool]
@@ -228,13 +229,16 @@ def _unschedulable(pod: Body) -> bool:
 
 def _waited_longer_each_time(pool: Pool) -> None:
     """The second worker came a second after the end of the first, the third two after that."""
-    pods = {pod["metadata"]["name"]: pod for pod in pool.pods}
-    came = sorted((pool.scene.first("pods", _named(name)), name) for name in pods)
-    ended = [pool.scene.first("pods", _named(name, has_ended)) for _, name in came]
-    waits = [came[turn + 1][0] - ended[turn] for turn in range(2)]
-    assert waits[0] > 0.9
-    assert waits[1] > 1.9
+    first, second, third = pool.pods
+    assert _seconds_between(first, second) >= 1
+    assert _seconds_between(second, third) >= 2
 
 
-def _named(name: str, condition: Callable[[Body], bool] = bool) -> Callable[[Body], bool]:
-    return lambda pod: pod["metadata"]["name"] == name and condition(pod)
+def _seconds_between(ended: Body, made: Body) -> float:
+    """Return the time from a worker's end to the next pod; both are whole seconds."""
+    end = state_of(ended)["terminated"]["finishedAt"]
+    return (_time(made["metadata"]["creationTimestamp"]) - _time(end)).total_seconds()
+
+
+def _time(text: str) -> datetime.datetime:
+    return datetime.datetime.fromisoformat(text)

@@ -49,7 +49,9 @@ class Token:
 
 def test_a_token_that_is_not_taken(programs: Programs, scene: Scene, tmp_path: Path) -> None:
     programs.kubeconfig = write_kubeconfig(scene, tmp_path / "config", {"token": "expired"})
-    output = programs.start("outside", "mapping.py").ends(status=1, seconds=15)
+    program = programs.start("outside", "mapping.py")
+    program.says("began")
+    output = program.ends(status=1, seconds=15)
     assert "FiberPoolError" in output
     assert "Unauthorized" in output
 

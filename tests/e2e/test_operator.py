@@ -98,8 +98,7 @@ def test_no_worker_is_lost_with_the_api_server(
     pool.scale(3)
     assert set(before) < set(pool.ready(3, seconds=60))
     assert len(pool.ever) == 3
-    (status,) = release.pod()["status"]["containerStatuses"]
-    assert status["ready"]
+    release.wait_until_ready()
 
 
 def test_a_second_operator_waits_and_takes_over(pool: Pool, agent: Body, release: Release) -> None:

@@ -86,6 +86,7 @@ def test_an_impossible_request_fails_at_once(case: str, programs: Programs, scen
     prepare, settings, words, seconds = REFUSED[case]
     prepare(scene)
     program = programs.start("outside", "mapping.py", **settings)
+    program.says("began")
     output = program.ends(status=1, seconds=seconds)
     assert "FiberPoolError" in output
     assert all(word in output for word in words), output
@@ -108,6 +109,7 @@ def test_a_program_without_an_operator_does_not_wait(programs: Programs, release
     release.stop()
     try:
         program = programs.start("outside", "mapping.py")
+        program.says("began")
         program.prints("operator", seconds=15)  # a warning, before it is an error
         output = program.ends(status=1, seconds=45)
         assert "FiberPoolError" in output
@@ -120,7 +122,9 @@ def test_a_program_without_an_operator_does_not_wait(programs: Programs, release
 @pytest.mark.usefixtures("bare_cluster")
 def test_a_cluster_without_fiber(programs: Programs, cluster: Cluster) -> None:
     programs.kubeconfig = cluster.kubeconfig  # an administrator's: the role went with the rest
-    output = programs.start("outside", "mapping.py").ends(status=1, seconds=15)
+    program = programs.start("outside", "mapping.py")
+    program.says("began")
+    output = program.ends(status=1, seconds=15)
     assert "FiberPoolError" in output
     assert "helm install" in output
 
@@ -154,6 +158,7 @@ def is_valid(scene: Scene, pool: Body) -> bool:
 @pytest.mark.usefixtures("older_definition")
 def test_fiberpools_of_an_older_version(programs: Programs) -> None:
     program = programs.start("outside", "mapping.py")
+    program.says("began")
     output = program.ends(status=1, seconds=15)
     assert all(word in output for word in ("FiberPoolError", "spec.onLost", "chart")), output
     leaves_nothing(program)
@@ -168,7 +173,9 @@ def test_a_second_program_learns_which_program_holds_a_pool(
     first = programs.start("outside", "mapping.py", *work, pool="warm")
     assert set(first.says("done")["hosts"]) <= set(there)
     identity = warm.body["spec"]["master"]["identity"]
-    output = programs.start("outside", "mapping.py", pool="warm").ends(status=1, seconds=15)
+    second = programs.start("outside", "mapping.py", pool="warm")
+    second.says("began")
+    output = second.ends(status=1, seconds=15)
     assert "FiberPoolError" in output
     assert identity in output
     first.interrupt()

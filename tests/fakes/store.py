@@ -10,7 +10,7 @@ import asyncio
 import datetime
 import json
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from typing import Any, NamedTuple
 
 Body = dict[str, Any]
@@ -231,9 +231,9 @@ class Store:
         """Watches from before now get 410 Gone."""
         self.oldest = self._version
 
-    async def changed(self) -> None:
-        """Wait for the next change."""
-        await self._bell.wait()
+    def changed(self) -> Coroutine[Any, Any, object]:
+        """Return what waits for the next change from now on, also if it is awaited later."""
+        return self._bell.wait()
 
     # -- Within
 

@@ -180,7 +180,10 @@ def test_a_killed_zygote_of_an_agent_costs_its_children_only(backend: LoopbackBa
 def test_after_good_work_agents_end_with_status_0(launch: Callable[..., Program]) -> None:
     script = """
         import fiber
+        from fiber._backends import loopback
         from fiber._runtime import state
+        from patience import PATIENCE
+        loopback._QUIT_TIMEOUT = PATIENCE
         if __name__ == "__main__":
             with fiber.Pool(2) as pool:
                 pool.map(abs, range(10))

@@ -88,11 +88,9 @@ def test_many_short_cuts_in_the_middle_of_work(wire: Wire) -> None:
         for number, result in enumerate(results):
             seen.append(result)
             if number % 15 == 0:
-                wire.proxy.sever()
-                wire.proxy.heal()
+                wire.cut()
     assert sorted(seen) == [n * n for n in range(60)]
     assert wire.agents() == ["loopback-0"]
-    assert wire.proxy.connections >= 4
 
 
 @pytest.mark.lost_after(2.0)

@@ -10,17 +10,22 @@ import pytest
 import fiber
 from faults import pool_targets as tasks
 from faults.raising import HangingEnv
+from fiber._runtime import exchange
 from fiber.errors import WorkerDied
 from fiber.vector import VectorEnv, worker_process
+from patience import PATIENCE
 
 pytestmark = pytest.mark.usefixtures("backend")
 
 
 @pytest.mark.parametrize("hang", [tasks.hang_in_python, tasks.hang_in_native_code])
-def test_a_task_over_its_time_says_where_each_thread_was(hang: Callable[[], None]) -> None:
+def test_a_task_over_its_time_says_where_each_thread_was(
+    hang: Callable[[], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(exchange, "STACK_PATIENCE", PATIENCE)
     with fiber.Pool(1) as pool:
         with pytest.raises(fiber.TimeoutError, match="took longer than its timeout") as caught:
-            pool.apply(hang, timeout=0.5)
+            pool.apply(hang, timeout=3)
         text = str(caught.value)
         assert f" in {hang.__name__}" in text
         assert " in wait_beside" in text
@@ -43,7 +48,7 @@ def test_an_environment_that_hangs_reports_its_stack(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(worker_process, "GRACE", 0.3)
-    env = VectorEnv([HangingEnv], num_workers=1, timeout=0.5)
+    env = VectorEnv([HangingEnv], num_workers=1, timeout=3)
     env.reset()
     with pytest.raises(fiber.TimeoutError, match=r"so worker .* was killed") as caught:
         env.step([0])

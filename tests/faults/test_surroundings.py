@@ -156,7 +156,7 @@ def test_an_almost_empty_environment(launch_on: Callable[..., Program]) -> None:
 
 
 FIRST_PROCESS = """
-    import fiber, os, subprocess, sys
+    import contextlib, fiber, os, subprocess, sys
     from pathlib import Path
     from faults.program import wait_for
 
@@ -165,7 +165,11 @@ FIRST_PROCESS = """
             subprocess.Popen(["sh", "-c", "sleep 0.1 &"]).wait()
 
     def processes():
-        return [stat.read_text().split()[1:3] for stat in Path("/proc").glob("[0-9]*/stat")]
+        found = []
+        for number in filter(str.isdecimal, os.listdir("/proc")):
+            with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # it is gone by now
+                found.append(Path("/proc", number, "stat").read_text().split()[1:3])
+        return found
 
     if __name__ == "__main__":
         print(os.getpid())

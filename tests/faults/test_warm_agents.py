@@ -9,11 +9,10 @@ import os
 import pickle
 import re
 import signal
-import socket
 import subprocess
 import sys
 import textwrap
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 
@@ -21,6 +20,7 @@ import pytest
 
 from faults.program import Program, wait_for
 from fiber._transport.credentials import WarmCredentials
+from ports import reserved_port
 from warm_key import WarmKey
 
 AGENT = """
@@ -80,14 +80,12 @@ MASTER = """
 class Pool:
     """Address where masters come and go, and one agent that dials it."""
 
-    def __init__(self, launch: Callable[..., Program], folder: Path) -> None:
+    def __init__(self, launch: Callable[..., Program], folder: Path, port: int) -> None:
         self.key = WarmKey()
+        self.address = f"127.0.0.1:{port}"
         self._folder = folder
         self._launch = launch
         self._epochs = itertools.count(1)
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            self.address = f"127.0.0.1:{free.getsockname()[1]}"
 
     def agent(self, grace: float, script: str = AGENT, epoch: int = 0, **env: str) -> Program:
         inherited = self.key.agent("warm-0", "uid", epoch).to_descriptor()
@@ -119,8 +117,9 @@ class Pool:
 
 
 @pytest.fixture
-def pool(launch: Callable[..., Program], tmp_path: Path) -> Pool:
-    return Pool(launch, tmp_path)
+def pool(launch: Callable[..., Program], tmp_path: Path) -> Iterator[Pool]:
+    with reserved_port() as port:
+        yield Pool(launch, tmp_path, port)
 
 
 def test_a_warm_agent_waits_longer_than_its_grace_for_its_first_master(pool: Pool) -> None:

@@ -33,6 +33,13 @@ class Wire:
         assert pid is not None
         return pid
 
+    def cut(self) -> None:
+        """Break the connection, and return once there is another one."""
+        before = self.proxy.connections
+        self.proxy.sever()
+        self.proxy.heal()
+        wait_for(lambda: self.proxy.connections > before)
+
     def start(self, target: Any = targets.block, *args: Any) -> Any:
         child = fiber.Process(target=target, args=args)
         child.start()

@@ -99,6 +99,11 @@ def wait_until_announced(path: Path, count: int = 1) -> list[int]:
     return pids
 
 
+def wait_for_gate(gate: Path | None) -> None:
+    if gate is not None:
+        wait_for(gate)
+
+
 def announce_and_wait(path: Path, gate: Path) -> str:
     announce(path)
     return wait_for(gate)

@@ -320,6 +320,7 @@ def blobs_at(backend: Any) -> int:
 def test_an_agent_is_sent_them_once_and_forgets_them_after_the_pool(backend: Any) -> None:
     with fiber.Pool(4, keep, (os.urandom(LARGE),)) as pool:
         assert pool.map(size_of_kept, range(8)) == [LARGE] * 8
+        pool.wait_until_workers_up(PATIENCE)  # the agent sends each of them a duplicate
         sent = backend.agents.agents["loopback-0"]._link.statistics().bytes_sent
         assert LARGE < sent < 1.5 * LARGE
         assert LARGE < blobs_at(backend) < 1.5 * LARGE

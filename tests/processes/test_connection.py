@@ -220,7 +220,8 @@ def test_the_end_comes_only_when_the_last_holder_has_gone() -> None:
     processes[1].join(PATIENCE)
 
 
-def test_the_end_says_how_the_other_process_died() -> None:
+def test_the_end_says_how_the_other_process_died(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connection, "_NEWS", PATIENCE)
     one, other = Pipe()
     ready = fiber.Event()
     process = start(hold, other, ready)

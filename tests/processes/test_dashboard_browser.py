@@ -231,7 +231,7 @@ def test_the_timeline_is_one_canvas_that_keys_move(watched: WatchedProgram, page
     timeline = page.locator("#timeline")
     assert timeline.locator("*").count() == 2  # however many tasks there are
     drawn = "() => document.querySelector('#timeline canvas').toDataURL().length"
-    assert page.evaluate(drawn) > 2000
+    page.wait_for_function(f"({drawn})() > 2000", timeout=MILLISECONDS)
     timeline.focus()
     whole = page.evaluate(drawn)
     for key in ("+", "+", "ArrowLeft", "-", "ArrowRight", "0"):
@@ -297,9 +297,10 @@ def test_the_page_draws_a_thousand_workers(browser: Browser, tmp_path: Path) -> 
     expect(figure(page, "processes")).to_have_text("1,000", timeout=MILLISECONDS)
     page.locator("#timeline").focus()
     page.keyboard.press("End")
-    timeline = page.locator("#timeline")
-    assert timeline.evaluate("place => place.scrollHeight") > 16_000
-    assert timeline.locator("*").count() == 2
+    page.wait_for_function(
+        "document.getElementById('timeline').scrollHeight > 16000", timeout=MILLISECONDS
+    )
+    assert page.locator("#timeline *").count() == 2
     context.close()
     assert problems == []
 

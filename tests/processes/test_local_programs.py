@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from census import wait_until
-from faults.program import Program
+from faults.program import Program, stop_and_wait
 from fiber._monitor import client
 from patience import PATIENCE
 from unit.pool_command_rig import run
@@ -129,7 +129,7 @@ def test_a_stopped_program_is_listed_as_silent(
 ) -> None:
     monkeypatch.setattr("fiber._cli.local._PATIENCE", 0.05)
     name = name_of(program)
-    os.kill(program.pid, signal.SIGSTOP)
+    stop_and_wait(program.pid)
     try:
         (row,) = json.loads(run("ps", "--output", "json").out)
         assert (row["state"], row["name"], row["pid"]) == ("silent", name, program.pid)

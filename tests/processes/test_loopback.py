@@ -425,7 +425,7 @@ def test_the_directory_of_an_agent_that_was_killed_while_it_made_it_is_removed(
         directory = process._files.directory
         assert directory is not None
         assert os.path.dirname(directory) == str(tmp_path)
-        os.mkdir(directory)
+        os.makedirs(directory, exist_ok=True)  # the agent may have made it by now
         os.kill(process.pid, signal.SIGKILL)  # type: ignore[arg-type]
         assert census.wait_until(lambda: not os.path.exists(directory), PATIENCE)
 

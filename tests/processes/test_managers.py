@@ -426,7 +426,7 @@ def test_an_initializer_that_raises_is_an_error_of_start(capfd: pytest.CaptureFi
 
 
 def test_a_manager_cannot_be_started_twice_or_after_its_end() -> None:
-    manager = SyncManager()
+    manager = SyncManager(shutdown_timeout=PATIENCE)
     manager.start()
     shared = manager.dict()
     with pytest.raises(fiber.ProcessError, match="Already started"):
@@ -441,7 +441,7 @@ def test_a_manager_cannot_be_started_twice_or_after_its_end() -> None:
 
 
 def test_a_manager_that_is_collected_on_the_loop_thread_ends_too() -> None:
-    manager = SyncManager()
+    manager = SyncManager(shutdown_timeout=PATIENCE)
     manager.start()
     process = manager._process
     runtime().loop.call_soon(manager.shutdown)

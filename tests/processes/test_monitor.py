@@ -120,6 +120,7 @@ def test_a_stopped_worker_is_said_to_be_stopped(pool: Pool) -> None:
 
 def test_all_children_and_the_program_show_their_stacks(pool: Pool) -> None:
     pool.apply(abs, (-1,))
+    assert wait_until(lambda: pool.workers()[0].state == "idle", PATIENCE)
     process = fiber.Process(target=tasks.hang_in_python, name="hangs")
     process.start()
     try:

@@ -476,12 +476,15 @@ def test_as_many_tasks_as_workers_run_at_once(
 
 
 def test_short_calls_pass_a_long_map(pool: Pool, tmp_path: Path) -> None:
-    gate = tmp_path / "gate"
-    long = pool.map_async(tasks.nap_and_return, range(2000), 1)
-    assert pool.apply(tasks.square, (3,)) == 9
-    assert not long.ready()
-    gate.touch()
-    assert long.get(PATIENCE) == list(range(2000))
+    begin, end = tmp_path / "begin", tmp_path / "end"
+    # Its first tasks hold all three workers, and its later ones wait for the result of the call.
+    gates = [begin] * 3 + [None] * 1000 + [end] * 1000
+    long = pool.map_async(tasks.wait_for_gate, gates, 1)
+    short = pool.apply_async(tasks.square, (3,))
+    begin.touch()
+    assert short.get(PATIENCE) == 9
+    end.touch()
+    assert len(long.get(PATIENCE)) == len(gates)
 
 
 # Beyond multiprocessing

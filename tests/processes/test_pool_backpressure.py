@@ -36,7 +36,7 @@ def pool(monkeypatch: pytest.MonkeyPatch) -> Iterator[Pool]:
 
 
 def _is_held_back(pool: Pool) -> bool:
-    return any(job.paused for job in pool._executor._scheduler.ledger.jobs)
+    return any(job.paused for job in list(pool._executor._scheduler.ledger.jobs))
 
 
 def _unread(iterator: Any) -> int:

@@ -32,10 +32,12 @@ libc.pthread_create(ctypes.byref(helper), None, libc.pause, None)
 libc.pthread_setname_np(helper, b"a helper")
 """
 ENDED_THREAD = """
-import threading
+import os, threading, time
 thread = threading.Thread(target=int)
 thread.start()
 thread.join()
+while len(os.listdir("/proc/self/task")) > 1:  # the system ends it a moment later
+    time.sleep(0.001)
 """
 ENDS_BEFORE_A_FORK = """
 import os, threading

@@ -163,6 +163,8 @@ def test_a_broken_backend(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(loopback, "interpreter_arguments", lambda *_: waits)
     queue: Any = fiber.Queue()
     with running() as backend:
+        process = backend._slots[0].process
+        wait_until(lambda: process.pid is not None, "the agent's process runs")
         error = StartError("the agents", "none joined")
         state.runtime().loop.call_soon(backend.agents.fail, error)
         check_that_nothing_stays(

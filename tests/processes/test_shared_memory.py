@@ -123,7 +123,7 @@ def test_a_list_is_shared() -> None:
 
 
 def test_a_manager_removes_its_shared_memory() -> None:
-    manager = SharedMemoryManager()
+    manager = SharedMemoryManager(shutdown_timeout=PATIENCE)
     with pytest.raises(ValueError, match="does not run"):
         manager.SharedMemory(size=10)
     with manager:

@@ -296,7 +296,7 @@ class Fake(Kube):
         self.host, self.port = "127.0.0.1", port
         self._api = api
 
-    def kubectl(self, *arguments: str, stdin: str = "") -> str:
+    def kubectl(self, *arguments: str, stdin: str = "", seconds: float = 60) -> str:
         if "delete" in arguments:
             self._api.namespaces -= {*arguments} if "--selector" not in arguments else set()
             return ""

@@ -406,7 +406,7 @@ def test_output_that_was_closed_before_is_left_out(site: Site) -> None:
 def test_the_log_of_the_pod_has_what_was_shown(site: Site) -> None:
     site.write("train.py", WAITS.format(then="sys.exit(9)"))
     command = site.begin()
-    assert site.nodes.log_of(site.pod()) == b"begun\n"
+    site.nodes.wait(lambda: site.nodes.log_of(site.pod()) == b"begun\n")
     interrupt(command)
     site.end(command)
     assert json.loads(site.variables()["FIBER_LAUNCHER_COMMAND"])[0] == "python"

@@ -14,8 +14,10 @@ import pytest
 
 from fakes.program_nodes import Launched, ProgramNodes
 from fakes.served import served
+from fiber._backends.kubernetes.port_forward import PortForward
 from fiber._cli import programs, streams
 from fiber._cli.failures import CommandError
+from fiber._cli.forward import open_socket
 from fiber._cli.programs import LauncherClient, ProgramPod
 from fiber._cli.session import Session, connect
 from fiber.launcher import EXIT, RECORD, STATUS, STDOUT
@@ -131,11 +133,20 @@ def test_a_connection_that_is_silent_for_long_is_broken(
     site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Read from a node that is gone, which nothing says."""
-    monkeypatch.setattr(programs, "_SILENCE", 0.1)
+    sockets: list[socket.socket] = []
+
+    def open_and_keep(forward: PortForward) -> socket.socket:
+        sockets.append(open_socket(forward))
+        return sockets[-1]
+
+    monkeypatch.setattr(programs, "open_socket", open_and_keep)
     data = RECORD.pack(STDOUT, 3) + b"abc"
     with site.answering(HEAD + data):
         records = site.client.output(0)
         assert next(records) == (STDOUT, b"abc")
+        (sock,) = sockets
+        assert sock.gettimeout() == programs._SILENCE
+        sock.settimeout(0.1)
         with pytest.raises(TimeoutError):
             next(records)
 

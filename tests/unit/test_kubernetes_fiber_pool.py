@@ -428,9 +428,12 @@ def test_a_silent_operator_is_reported(
     rig: Rig, told: Told, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fiber_pool, "OPERATOR_SLOW", 0.05)
-    monkeypatch.setattr(fiber_pool, "OPERATOR_ABSENT", 0.2)
     rig.operator.mute = True
-    rig.own(told).demand(1)
+    client = rig.own(told)
+    client.demand(1)
+    told.wait(lambda: told.warnings)
+    monkeypatch.setattr(fiber_pool, "OPERATOR_ABSENT", 0.0)
+    client.demand(2)
     error = told.error()
     assert error.reason == "NoOperator"
     assert "helm install fiber-operator" in str(error)

@@ -143,7 +143,7 @@ def test_without_a_descriptor_the_loop_does_not_spin(
         patch.setattr(server, "_ACCEPT_AGAIN", 3600.0)
         with pytest.raises(client.NoAnswer, match="does not answer"):
             list(client.ask(listening, {}, patience=0.05))
-    assert refusals == []
+        assert wait_until(lambda: not refusals, PATIENCE)
 
 
 def test_a_program_for_which_too_many_wait_has_not_ended(folder: Path) -> None:

@@ -317,9 +317,9 @@ def test_a_client_that_never_began_closes(at: RelaySite) -> None:
 
 
 def test_close_during_a_pause(at: RelaySite, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(relay_client, "_PAUSE_MIN", PATIENCE)
     monkeypatch.setattr(relay_client, "_PAUSE_MAX", PATIENCE)
     client = at.client()
-    client._pause = PATIENCE
     at.told.wait(lambda: at.told.troubles)
     client.close()
     assert len(at.told.troubles) <= 2
