@@ -201,7 +201,7 @@ class _Interpreter:
         """Return the seconds until the next report must come."""
         if self.done:
             return EXIT_LIMIT
-        return self.target.limit if self.current else START_LIMIT
+        return self.target.limit if self.current else max(START_LIMIT, self.target.limit)
 
     def _read(self, reports: int) -> bool:
         chunk = os.read(reports, 1 << 16)

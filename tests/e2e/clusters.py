@@ -77,7 +77,7 @@ class Cluster:
     def workers(self) -> list[str]:
         """The nodes on which pods are put, by name."""
         nodes = json.loads(self.kubectl("get", "nodes", "--output", "json"))["items"]
-        return sorted(node["metadata"]["name"] for node in nodes if not node["spec"].get("taints"))
+        return sorted(node["metadata"]["name"] for node in nodes if _takes_pods(node["spec"]))
 
     @contextlib.contextmanager
     def cut_off(self, node: str) -> Iterator[None]:
@@ -374,6 +374,12 @@ def _given_images(environment: Mapping[str, str]) -> dict[str, str]:
 def _variable(image: str) -> str:
     """fiber-worker-rl: FIBER_E2E_WORKER_RL_IMAGE."""
     return f"FIBER_E2E_{image.removeprefix('fiber-').replace('-', '_').upper()}_IMAGE"
+
+
+def _takes_pods(node: Mapping[str, Any]) -> bool:
+    """Return whether pods may be put on a node; the taint of a cordoned one comes and goes late."""
+    taints = {taint["key"] for taint in node.get("taints", [])}
+    return not node.get("unschedulable") and taints <= {"node.kubernetes.io/unschedulable"}
 
 
 def _gateway() -> str:

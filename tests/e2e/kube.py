@@ -41,6 +41,7 @@ _PATIENCE = 60.0
 _PAUSE = 0.1
 
 MERGE = "application/merge-patch+json"
+JSON_PATCH = "application/json-patch+json"
 APPLY = "application/apply-patch+yaml"
 
 
@@ -155,7 +156,7 @@ class Kube:
         self,
         method: str,
         path: str,
-        body: Body | None = None,
+        body: Body | list[Body] | None = None,
         *,
         kind: str = "application/json",
         query: Mapping[str, str] | None = None,
@@ -165,7 +166,12 @@ class Kube:
         return answer
 
     def _send(
-        self, method: str, path: str, body: Body | None, kind: str, query: Mapping[str, str]
+        self,
+        method: str,
+        path: str,
+        body: Body | list[Body] | None,
+        kind: str,
+        query: Mapping[str, str],
     ) -> bytes:
         connection = http.client.HTTPConnection(self.host, self.port, timeout=_PATIENCE)
         try:

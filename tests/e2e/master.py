@@ -171,7 +171,8 @@ def main() -> None:
 
     def say(event: str, **facts: object) -> None:
         at = round(time.monotonic() - started, 3)
-        print(json.dumps({"event": event, "at": at, **facts}), flush=True)
+        line = json.dumps({"event": event, "at": at, **facts})
+        print(line + "\n", end="", flush=True)  # in one write, as two threads print
 
     loop = Loop()
     loop.start_thread("master-io")
@@ -198,8 +199,8 @@ def main() -> None:
     started = time.monotonic()
     epoch = api.attach(master)
     api.sign(credentials, epoch)
-    loop.call_soon(listener.look_again)
     say("attached", address=listener.address, epoch=epoch)
+    loop.call_soon(listener.look_again)
     told = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: told.set())
     told.wait()

@@ -121,6 +121,8 @@ class Outside(Program):
         self._temporary = tempfile.TemporaryDirectory(prefix="program-")
         self._process = subprocess.Popen(
             [*prefix, sys.executable, str(script), *arguments],
+            # Unbuffered, ``print`` writes the end of a line by itself.  Output of a worker may come
+            # between the two, so that programs print a line of JSON together with its end.
             env={**environment, "PYTHONUNBUFFERED": "1", "TMPDIR": self._temporary.name},
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,

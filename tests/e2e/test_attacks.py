@@ -86,7 +86,7 @@ def test_a_neighbour_changes_and_deletes_the_pool_of_a_program(
 ) -> None:
     """A known limit: the role fiber-user is for one namespace, not for one pool."""
     config = kubeconfig_of(scene, tmp_path)
-    program = programs.start("outside", "mapping.py", "--tasks", 100, "--seconds", 0.2)
+    program = programs.start("outside", "mapping.py", "--tasks", 200, "--seconds", 0.2)
     program.says("first")
     (pool,) = scene.now["fiberpools"]
     neighbour = (find_program("kubectl"), "--kubeconfig", config, "--namespace", scene.namespace)
@@ -94,7 +94,7 @@ def test_a_neighbour_changes_and_deletes_the_pool_of_a_program(
     run(*neighbour, "patch", "fiberpool", pool, "--type=merge", "--patch", change)
     run(*neighbour, "delete", "fiberpool", pool, "--wait=false")
     program.prints(f"the FiberPool {pool!r} in namespace {scene.namespace!r} was deleted")
-    assert program.says("done", seconds=90)["total"] == squares(100)
+    assert program.says("done", seconds=90)["total"] == squares(200)
     program.ends()
     leaves_nothing(program)
 

@@ -60,6 +60,34 @@ def is_told_soon(pool: Pool, reported: Callable[[Body], bool], reason: str, **fi
     record(f"{pool.name}: {reason}", pool.told_after(reported, reason, **fields))
 
 
+# First, as the kubelet tries again to mount a volume ever later.
+def test_a_secret_that_is_missing(pools: Pools) -> None:
+    pool = pools["no-secret"]
+    problem = pool.has_problem("CreateContainerConfigError", severity="Error")
+    assert says(
+        problem["message"], problem["pod"], 'secret "absent" not found', "Create the missing Secret"
+    )
+    assert not problem.get("terminal")
+    is_told_soon(pool, waits_for("CreateContainerConfigError"), "CreateContainerConfigError")
+
+
+def test_a_volume_that_is_missing(pools: Pools) -> None:
+    pool = pools["no-volume"]
+    problem = pool.has_problem("FailedMount")
+    assert says(problem["message"], problem["pod"], 'secret "absent-too" not found')
+
+
+def test_the_missing_secrets_come(pools: Pools, module_scene: Scene) -> None:
+    waiting = [pools["no-secret"], pools["no-volume"]]
+    pods = [{pod["metadata"]["name"] for pod in pool.pods} for pool in waiting]
+    for name in ("absent", "absent-too"):
+        secret = {"metadata": {"name": name}, "stringData": {"key": "x"}}
+        module_scene.kube.create(module_scene.path("secrets"), secret)
+    for pool, before in zip(waiting, pods, strict=True):
+        assert set(pool.ready(1, seconds=100)) == before
+        assert not pool.status["problems"]
+
+
 def test_an_image_that_cannot_be_pulled(pools: Pools) -> None:
     pool = pools["bad-image"]
     problem = pool.has_problem("ImagePullError", severity="Error", seconds=60)
@@ -110,33 +138,6 @@ def test_an_image_that_is_not_there_and_not_to_be_pulled(pools: Pools) -> None:
     problem = pool.has_problem("ErrImageNeverPull", severity="Error", terminal=True)
     assert says(problem["message"], problem["pod"], "Never", "absent:1", "Load the image")
     is_told_soon(pool, waits_for("ErrImageNeverPull"), "ErrImageNeverPull")
-
-
-def test_a_secret_that_is_missing(pools: Pools) -> None:
-    pool = pools["no-secret"]
-    problem = pool.has_problem("CreateContainerConfigError", severity="Error")
-    assert says(
-        problem["message"], problem["pod"], 'secret "absent" not found', "Create the missing Secret"
-    )
-    assert not problem.get("terminal")
-    is_told_soon(pool, waits_for("CreateContainerConfigError"), "CreateContainerConfigError")
-
-
-def test_a_volume_that_is_missing(pools: Pools) -> None:
-    pool = pools["no-volume"]
-    problem = pool.has_problem("FailedMount")
-    assert says(problem["message"], problem["pod"], 'secret "absent-too" not found')
-
-
-def test_the_missing_secrets_come(pools: Pools, module_scene: Scene) -> None:
-    waiting = [pools["no-secret"], pools["no-volume"]]
-    pods = [{pod["metadata"]["name"] for pod in pool.pods} for pool in waiting]
-    for name in ("absent", "absent-too"):
-        secret = {"metadata": {"name": name}, "stringData": {"key": "x"}}
-        module_scene.kube.create(module_scene.path("secrets"), secret)
-    for pool, before in zip(waiting, pods, strict=True):
-        assert set(pool.ready(1, seconds=100)) == before
-        assert not pool.status["problems"]
 
 
 def test_a_worker_that_fits_nowhere(pools: Pools) -> None:
@@ -209,7 +210,14 @@ def test_a_program_that_is_not_in_the_image(pools: Pools) -> None:
 
 def test_a_worker_that_is_never_ready(pools: Pools) -> None:
     pool = pools["never-ready"]
-    problem = pool.has_problem("StartupTimeout", severity="Error", seconds=90)
+
+    def deleted() -> Body | None:
+        """Return the problem of a worker that ran for so long; it has others before."""
+        found = pool.problem("StartupTimeout")
+        return found if found and "It was deleted" in found["message"] else None
+
+    problem = pool.wait("a late worker is deleted", deleted, seconds=90)
+    assert problem["severity"] == "Error"
     words = (problem["pod"], "20 s", "startupTimeoutSeconds", "not become ready", "probe failed")
     assert says(problem["message"], *words)
     assert pool.status["failures"]["total"] >= 1

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from e2e.clusters import Cluster, Own, find_program
-from e2e.kube import Kube, path_of
+from e2e.kube import Kube
 from e2e.release import Release
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -125,7 +125,7 @@ def after(bare_cluster: None, release: Release, kube: Kube) -> Iterator[None]:
     kube.kubectl(*delete, "configmap", "pi")
     kube.kubectl(*delete, "--filename", str(ROOT / "examples" / "01-pi" / "job.yaml"))
     release.helm("uninstall", "fiber-operator", "--namespace", "fiber-system", "--ignore-not-found")
-    kube.delete(path_of("namespaces", name="fiber-system"))
+    kube.delete_namespaces("fiber-system")
 
 
 @pytest.mark.timeout(600, func_only=True)  # `helm test` has a limit of five minutes

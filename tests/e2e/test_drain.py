@@ -55,7 +55,7 @@ def test_tasks_that_end_in_time_run_once(programs: Programs, scene: Scene) -> No
 
 
 @pytest.mark.parametrize(
-    ("grace", "seconds"), [(6, 20), pytest.param(30, 60, marks=pytest.mark.long)]
+    ("grace", "seconds"), [(6, 30), pytest.param(30, 60, marks=pytest.mark.long)]
 )
 def test_tasks_that_do_not_end_in_time_run_elsewhere(
     grace: int, seconds: int, programs: Programs, scene: Scene, tmp_path: Path
@@ -118,7 +118,7 @@ def start(
     """A program whose tasks say that they run, and are never to run again after a death."""
     limits = ("--retries", 0, "--disruptions", disruptions)
     work = ("--task", "loud", "--workers", WORKERS, "--tasks", tasks, "--seconds", seconds)
-    return programs.start("outside", "mapping.py", *work, *limits, **settings)
+    return programs.start("outside", "mapping.py", *work, *limits, "--together", **settings)
 
 
 def tasks_under_way(scene: Scene, program: Program) -> list[tuple[int, str]]:

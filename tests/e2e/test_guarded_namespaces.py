@@ -66,13 +66,13 @@ def test_a_worker_that_ends_before_its_sidecar_is_replaced(
     if cluster.outside is None:
         pytest.skip(f"{cluster.description}: the API server cannot reach a webhook of the tests")
     with sidecars(scene, cluster.outside, image, tmp_path):
-        program = programs.start("inside", "mapping.py", "--tasks", 300, "--seconds", 0.1)
+        program = programs.start("inside", "mapping.py", "--tasks", 600, "--seconds", 0.1)
         program.says("first")
         (victim, *_) = scene.wait(
             "a worker is Ready", lambda: list(filter(is_ready, workers(scene)))
         )
         cluster.kill(victim, names.WORKER_CONTAINER)
-        assert program.says("done")["total"] == squares(300)
+        assert program.says("done")["total"] == squares(600)
         program.ends()
         leaves_nothing(program)
     pods = list(filter(is_worker, ever(scene, "pods").values()))

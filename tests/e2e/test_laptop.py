@@ -123,7 +123,7 @@ def program_stopped(trouble: LaptopTrouble) -> Iterator[None]:
 @pytest.mark.parametrize(
     ("fault", "seconds"),
     [
-        (relay_killed, 0.04),
+        (relay_killed, 0.06),
         pytest.param(relay_deleted, 0.04, marks=pytest.mark.long),
         (address_changed, 0.06),
         pytest.param(cable_cut_and_address_changed, 0.25, marks=pytest.mark.long),

@@ -115,8 +115,8 @@ def node_back_too_late(trouble: OperatorTrouble) -> Iterator[None]:
 @pytest.mark.parametrize(
     ("fault", "seconds"),
     [
-        (pod_deleted, 0.04),
-        (container_killed, 0.04),
+        (pod_deleted, 0.06),
+        (container_killed, 0.06),
         (operator_killed, 0.04),
         pytest.param(api_server_stopped, 0.25, marks=pytest.mark.long),
         pytest.param(node_cut_off, 0.1, marks=pytest.mark.long),

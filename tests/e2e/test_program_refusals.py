@@ -24,13 +24,22 @@ def nothing_done(_: Scene) -> None: ...
 
 
 def no_pods_allowed(scene: Scene) -> None:
-    hard = {"metadata": {"name": "none"}, "spec": {"hard": {"pods": "0"}}}
-    scene.kube.create(scene.path("resourcequotas"), hard)
+    make_quota(scene, "none", pods="0")
 
 
 def quota_on_requests(scene: Scene) -> None:
-    hard = {"metadata": {"name": "counted"}, "spec": {"hard": {"requests.memory": "1Gi"}}}
-    scene.kube.create(scene.path("resourcequotas"), hard)
+    make_quota(scene, "counted", **{"requests.memory": "1Gi"})
+
+
+def make_quota(scene: Scene, name: str, **hard: str) -> None:
+    """Make a ResourceQuota, and wait until it is in force."""
+    path = scene.path("resourcequotas")
+    scene.kube.create(path, {"metadata": {"name": name}, "spec": {"hard": hard}})
+
+    def limits() -> object:
+        return (scene.kube.get(f"{path}/{name}") or {}).get("status", {}).get("hard")
+
+    scene.wait("the quota is in force", limits, poll=0.2)
 
 
 def limits(**kinds: str) -> Callable[[Scene], None]:

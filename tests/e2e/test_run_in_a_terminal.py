@@ -30,7 +30,7 @@ atexit.register(end)
 print("running", flush=True)
 """
 STOPS = """
-import signal, sys
+import signal, sys, time
 
 def terminated(*_):
     print("saving", flush=True)
@@ -38,7 +38,8 @@ def terminated(*_):
 
 signal.signal(signal.SIGTERM, terminated)
 print("running", flush=True)
-signal.pause()
+while True:
+    time.sleep(0.1)
 """
 WORKERS = """
 import signal

@@ -45,8 +45,10 @@ from benchmarks.session import Failed, Session  # noqa: E402
 from benchmarks.suite import MEASURES  # noqa: E402
 from benchmarks.tasks import no_op  # noqa: E402
 
+from census import wait_until  # noqa: E402
 from fiber._agent.interface import ChildSpec  # noqa: E402
 from fiber._wire import work  # noqa: E402
+from patience import PATIENCE  # noqa: E402
 
 BASELINE = BY_NAME["multiprocessing"]
 
@@ -287,7 +289,7 @@ def test_a_contender_that_takes_too_long_is_stopped_with_its_workers(session: Se
     endless = {"calls": 10**9, "seconds": 600.0}
     with pytest.raises(Failed, match="not finished after 1 s"):
         session.run(Case("latency", "apply", "", "apply", endless, APPLY, limit=1.0))
-    below = processes.descendants(session.pid)
-    assert len(below) == 5
+    assert wait_until(lambda: len(processes.descendants(session.pid)) == 5, PATIENCE)
+    pids = session.pid, *processes.descendants(session.pid)
     session.interrupt()
-    assert not any(os.path.exists(f"/proc/{pid}") for pid in (session.pid, *below))
+    assert wait_until(lambda: not any(os.path.exists(f"/proc/{pid}") for pid in pids), PATIENCE)

@@ -36,10 +36,10 @@ def test_an_example_of_the_help_succeeds(site: Site, words: list[str]) -> None:
 def test_a_program_may_take_its_time_to_end(site: Site) -> None:
     site.write(
         "train.py",
-        "import signal, sys\n"
+        "import signal, sys, time\n"
         "signal.signal(signal.SIGTERM, lambda *_: sys.exit('saved'))\n"
         "print('begun', flush=True)\n"
-        "signal.pause()\n",
+        "while True: time.sleep(0.1)\n",
     )
     command = site.begin("run", "--name", "mine", "train.py")
     assert site.fiber("stop", "mine") == Outcome(0, "asked the program 'mine' to end\n", "")

@@ -11,6 +11,7 @@ import signal
 import socket
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from queue import SimpleQueue
@@ -478,7 +479,8 @@ def test_ctrl_c_in_an_action_breaks_the_barrier(moved: Moved) -> None:
 
     def act() -> None:
         acting.set()
-        signal.pause()
+        while True:  # one long wait would miss a signal that came just before it
+            time.sleep(0.1)
 
     there._action = act
     with comers(there) as (other,):

@@ -78,7 +78,7 @@ def test_a_slow_reader_bounds_what_travels(
         def nothing_travels() -> bool:
             nonlocal frames
             before, frames = frames, up.frames
-            waits = any(handler.waiting for handler in hosts["a"]._handlers)
+            waits = any(handler.waiting for handler in list(hosts["a"]._handlers))
             return waits and frames == before
 
         assert wait_until(nothing_travels, PATIENCE)
@@ -91,7 +91,7 @@ def test_items_of_a_lost_host_that_were_not_sent_do_not_count(hosts: Hosts, far:
     with queue_and_remote(far) as (queue, remote):
         for number in range(ITEMS):
             remote.put(number)
-        waiting = lambda: any(handler.waiting for handler in hosts["a"]._handlers)  # noqa: E731
+        waiting = lambda: any(handler.waiting for handler in list(hosts["a"]._handlers))  # noqa: E731
         assert wait_until(waiting, PATIENCE)
         hosts.on_loop(hosts["a"].unlink, "b", "its agent is lost")
         assert wait_until(lambda: not hosts["a"]._handlers, PATIENCE)

@@ -97,7 +97,7 @@ def test_an_interrupted_receive_loses_no_message(
 ) -> None:
     here, there = far_pipe
     there.poll(0)
-    asked = lambda: any(session.waiting for session in hosts["a"]._handlers)  # noqa: E731
+    asked = lambda: any(session.waiting for session in list(hosts["a"]._handlers))  # noqa: E731
     interrupter = background(interrupt_main_thread, asked)
     with pytest.raises(Interrupted):
         there.recv()

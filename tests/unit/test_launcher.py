@@ -90,7 +90,7 @@ def test_a_process_that_is_left_behind_does_not_keep_the_pod(site: Site) -> None
 
 
 def test_two_readers_get_everything(site: Site) -> None:
-    pod = site.python("import os, signal\nos.write(1, b'one\\n')\nsignal.pause()")
+    pod = site.python("import os, time\nos.write(1, b'one\\n')\nwhile True: time.sleep(0.1)")
     both: list[Records] = []
     told = threading.Semaphore(0)
 
@@ -112,10 +112,10 @@ def test_two_readers_get_everything(site: Site) -> None:
 
 def test_a_reader_goes_on_where_another_broke_off(site: Site) -> None:
     pod = site.python(
-        "import os, signal\n"
+        "import os, signal, time\n"
         "signal.signal(signal.SIGTERM, lambda *_: (os.write(1, b'two'), os._exit(9)))\n"
         "os.write(1, b'one')\n"
-        "while True: signal.pause()"
+        "while True: time.sleep(0.1)"
     )
     assert text(pod.read(until=b"one")) == b"one"
     rest = pod.read(3, begun=lambda: pod.signal(signal.SIGTERM))

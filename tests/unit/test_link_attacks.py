@@ -17,11 +17,12 @@ import pytest
 from fiber._transport import authentication
 from fiber._transport.authentication import AgentHello, Identity, MasterRefusal, decode_greeting
 from fiber._transport.credentials import make_credentials
+from fiber._transport.link import Keepalive
 from fiber._transport.listener import MasterListener
 from fiber.errors import AuthenticationError, LinkError
 from patience import PATIENCE
 from unit.attacker import CUT, DOWN, MESSAGE, TLS, UP, Path, Unit
-from unit.link_site import Notes, Site, complete, port_of, say
+from unit.link_site import SHORT, Notes, Site, complete, port_of, say
 
 FRAMES = [b"%d " % number * 50 for number in range(30)]
 HOPS = 8 + 4
@@ -106,8 +107,8 @@ def talk(site: Site, path: Path, listener: MasterListener, master: Notes) -> Not
 def path_of(site: Site) -> Iterator[Callable[..., tuple[Path, MasterListener, Notes]]]:
     paths: list[Path] = []
 
-    def make(meddle: Any) -> tuple[Path, MasterListener, Notes]:
-        listener, master = site.listener()
+    def make(meddle: Any, keepalive: Keepalive = SHORT) -> tuple[Path, MasterListener, Notes]:
+        listener, master = site.listener(keepalive=keepalive)
         paths.append(Path(listener, meddle))
         return paths[-1], listener, master
 
@@ -142,7 +143,7 @@ def test_a_delay_costs_time(site: Site, path_of: Any) -> None:
         return [unit.data]
 
     once = Once(lambda unit: unit.kind == MESSAGE and unit.number == 4, delay)
-    path, listener, master = path_of(once)
+    path, listener, master = path_of(once, SHORT._replace(suspect_after=30.0, lost_after=60.0))
     agent = talk(site, path, listener, master)
     assert agent.frames == master.frames == FRAMES
     assert path.connections == 1

@@ -117,7 +117,9 @@ def test_an_address_without_an_answer_is_soon_asked_again(
     """The kernel alone would be silent for minutes, and ask where a Service led at first."""
     monkeypatch.setattr(dialer, "_CONNECT", 0.2)
     with black_hole() as address:
-        _, agent = site.dialer(address, timeout=0.5)
+        dialling, agent = site.dialer(address)
+        wait_for(lambda: "no answer" in dialling._obstacle)
+        site.on_loop(dialling._too_late)
         agent.wait(lambda: agent.errors)
     assert "no answer within 0.2 s" in str(agent.errors[0])
 

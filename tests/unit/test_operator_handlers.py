@@ -25,6 +25,7 @@ from fiber_operator.process import OperatorProcess
 from fiber_operator.settings import OperatorSettings
 from fiber_operator.watches import KopfThread
 from fiber_operator.workqueue import Key
+from patience import PATIENCE
 
 ES = Key(NAMESPACE, "es")
 Notice = tuple[Key, str, int]
@@ -353,9 +354,9 @@ def test_the_thread_tells_the_loop_that_made_it_and_ends_with_it() -> None:
             program = OperatorProcess(settings, configure=configure, now=world.store.unix_now)
             task = asyncio.ensure_future(program.run(stop))
             world.make_pool(replicas=2)
-            await world.ready(2, within=10)
+            await world.ready(2, within=PATIENCE)
             world.kubelet.evict(NAMESPACE, world.names()[0])
-            await world.until(lambda: world.status()["failures"]["disrupted"] == 1, within=10)
+            await world.until(lambda: world.status()["failures"]["disrupted"] == 1, within=PATIENCE)
             stop.set()
             await task
 

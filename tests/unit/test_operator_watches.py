@@ -114,7 +114,7 @@ async def ask(program: OperatorProcess) -> tuple[int, str]:
 
 async def until(world: World, program: OperatorProcess, said: str) -> None:
     """Wait until /readyz says so."""
-    await world.until(lambda: bool(program.port), within=10)
+    await world.until(lambda: bool(program.port), within=PATIENCE)
     async with asyncio.timeout(PATIENCE):
         while said not in (await ask(program))[1]:
             await asyncio.sleep(0.05)

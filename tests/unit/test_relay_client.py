@@ -25,6 +25,7 @@ from fiber._wire.streams import hello
 from fiber_api import names
 from fiber_api.rest import ApiError, Forbidden
 from patience import PATIENCE
+from ports import reserved_port
 from unit.kubernetes_rig import NAMESPACE, kubeconfig
 from unit.link_site import Notes, Site
 
@@ -171,8 +172,10 @@ def test_an_end_of_the_relay_is_told_and_mended(at: RelaySite) -> None:
     at.client()
     at.told.wait_until_open()
     site = at.site
-    at.site.on_loop(at.relay.close)
-    at.told.wait_for_trouble("error forwarding port")
+    with reserved_port() as nothing:
+        at.server.api.forwards.target = nothing
+        at.site.on_loop(at.relay.close)
+        at.told.wait_for_trouble("error forwarding port")
     at.relay = site.on_loop(lambda: Relay(site.loop, 0, 0, lambda line: None))
     at.server.api.forwards.target = at.relay.master_port
     at.told.wait_until_open(2)

@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -443,9 +444,18 @@ def raise_either(x: int) -> None:
 
 
 @pytest.mark.parametrize("stride", [0, 1, 50])
-def test_a_batch_that_blocks_is_taken_apart(impatient: Rig, stride: int) -> None:
-    gate = threading.Event()
-    tasks.state["gate"] = gate
+def test_a_batch_that_blocks_is_taken_apart(
+    impatient: Rig, stride: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gate, begun = threading.Event(), threading.Event()
+    tasks.state.update(gate=gate, begun=begun)
+
+    def sleep(seconds: float) -> None:
+        begun.wait(PATIENCE)  # a stall before the task that blocks is not the task's
+        time.sleep(seconds)
+
+    timing = SimpleNamespace(sleep=sleep, perf_counter=lambda: 0.0)
+    monkeypatch.setattr(worker_module, "time", timing)
     helper = threading.Thread(target=open_when_given_back, args=(impatient, gate))
     helper.start()
     impatient.give(block_at_two, list(range(100)), stride=stride)
@@ -463,6 +473,7 @@ def open_when_given_back(rig: Rig, gate: threading.Event) -> None:
 
 def block_at_two(x: int) -> int:
     if x == 2:
+        tasks.state["begun"].set()
         assert tasks.state["gate"].wait(PATIENCE)
     return x
 

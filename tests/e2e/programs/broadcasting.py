@@ -37,7 +37,7 @@ def main() -> None:
         copies = (bytes_sent() - before) / SIZE
     right = set(hashes) == {hashlib.sha256(data).hexdigest()}
     said = {"event": "done", "copies": copies, "right": right, "hosts": hosts}
-    print(json.dumps(said), flush=True)
+    print(json.dumps(said) + "\n", end="", flush=True)
 
 
 if __name__ == "__main__":

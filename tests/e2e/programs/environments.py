@@ -110,7 +110,7 @@ def facts(
 
 def say(event: str, **facts: object) -> None:
     """A line for the test."""
-    print(json.dumps({"event": event, "at": time.monotonic(), **facts}), flush=True)
+    print(json.dumps({"event": event, "at": time.monotonic(), **facts}) + "\n", end="", flush=True)
 
 
 def _parse() -> argparse.Namespace:

@@ -19,7 +19,7 @@ def main() -> None:
     here, there = fiber.Pipe()
     process = fiber.Process(target=tell, args=(there,))
     process.start()
-    print(json.dumps({"event": "ran", "host": here.recv()}), flush=True)
+    print(json.dumps({"event": "ran", "host": here.recv()}) + "\n", end="", flush=True)
     process.join()
 
 

@@ -64,6 +64,8 @@ def main() -> None:
     say("began")
     hosts, total = set(), 0
     with pool_for(options) as pool:
+        if options.together:
+            pool.wait_until_workers_up()
         results = pool.imap(task, range(options.tasks), chunksize=1)
         for done, (result, host) in enumerate(results, 1):
             if done == 1:
@@ -93,7 +95,7 @@ def hold(seconds: int) -> None:
 
 def say(event: str, **facts: object) -> None:
     """A line for the test."""
-    print(json.dumps({"event": event, "at": time.monotonic(), **facts}), flush=True)
+    print(json.dumps({"event": event, "at": time.monotonic(), **facts}) + "\n", end="", flush=True)
 
 
 def _first_time() -> bool:
@@ -113,6 +115,7 @@ def _parse() -> argparse.Namespace:
     parser.add_argument("--retries", type=int, default=3)
     parser.add_argument("--disruptions", type=int, help="as configured, if it is not given")
     parser.add_argument("--most", type=int, help="workers, as many as the work asks for")
+    parser.add_argument("--together", action="store_true", help="begin once all workers are ready")
     parser.add_argument("--stay", action="store_true", help="keep the pool until a signal comes")
     parser.add_argument("--hold", type=int, default=0, help="seconds, when half is done")
     return parser.parse_args()

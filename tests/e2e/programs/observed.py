@@ -35,12 +35,12 @@ def main() -> None:
         for _ in results:
             begun.get()
         with contextlib.suppress(KeyboardInterrupt):
-            print(json.dumps({"event": "waiting", "total": total}), flush=True)
+            print(json.dumps({"event": "waiting", "total": total}) + "\n", end="", flush=True)
             for result in results:
                 result.wait()
             if "--stay" in sys.argv:
                 signal.pause()
-    print(json.dumps({"event": "left"}), flush=True)
+    print(json.dumps({"event": "left"}) + "\n", end="", flush=True)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,11 @@ def main() -> None:
         with fiber.Pool(8) as pool:
             pool.apply(os.getpid)
             took = time.monotonic() - asked
-            print(json.dumps({"event": "first", "asked": asked, "took": took}), flush=True)
+            print(
+                json.dumps({"event": "first", "asked": asked, "took": took}) + "\n",
+                end="",
+                flush=True,
+            )
             pool.map(os.path.basename, ["a/b"] * 100, chunksize=1)
 
 

@@ -31,7 +31,11 @@ def main() -> None:
     try:
         fiber.Ring(4, go_round).run()
     except MemberLost as loss:
-        print(json.dumps({"event": "lost", "rank": loss.rank, "text": str(loss)}), flush=True)
+        print(
+            json.dumps({"event": "lost", "rank": loss.rank, "text": str(loss)}) + "\n",
+            end="",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

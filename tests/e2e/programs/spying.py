@@ -64,7 +64,7 @@ def host(_: int) -> str:
 
 def say(event: str, **facts: object) -> None:
     """Print a line for the test."""
-    print(json.dumps({"event": event, **facts}), flush=True)
+    print(json.dumps({"event": event, **facts}) + "\n", end="", flush=True)
 
 
 def _all(kind: type[T]) -> list[T]:
