@@ -479,12 +479,12 @@ def test_short_calls_pass_a_long_map(pool: Pool, tmp_path: Path) -> None:
     begin, end = tmp_path / "begin", tmp_path / "end"
     # Its first tasks hold all three workers, and its later ones wait for the result of the call.
     gates = [begin] * 3 + [None] * 1000 + [end] * 1000
-    long = pool.map_async(tasks.wait_for_gate, gates, 1)
+    long = pool.starmap_async(tasks.pass_gate, enumerate(gates), 1)
     short = pool.apply_async(tasks.square, (3,))
     begin.touch()
     assert short.get(PATIENCE) == 9
     end.touch()
-    assert len(long.get(PATIENCE)) == len(gates)
+    assert long.get(PATIENCE) == list(range(len(gates)))
 
 
 # Beyond multiprocessing
