@@ -74,7 +74,7 @@ class Watch:
             lasting=Lasting(_runtime(), _address(), _excused(started), _nng_runs()),
             processes=frozenset(found.pid for found in started),
             threads=frozenset(threading.enumerate()),
-            descriptors=frozenset(_descriptors()),
+            descriptors=frozenset(descriptors()),
             files=frozenset(name for name in os.listdir(self._folder) if not self._probe(name)),
         )
 
@@ -181,11 +181,12 @@ def _opened(before: Snapshot, now: Snapshot) -> list[str]:
     return opened
 
 
-def _descriptors() -> list[tuple[int, str]]:
+def descriptors(pid: int | str = "self") -> list[tuple[int, str]]:
+    """Return the descriptors of a process, each with what it leads to."""
     found = []
-    for name in os.listdir("/proc/self/fd"):
+    for name in os.listdir(f"/proc/{pid}/fd"):
         try:
-            found.append((int(name), os.readlink(f"/proc/self/fd/{name}")))
+            found.append((int(name), os.readlink(f"/proc/{pid}/fd/{name}")))
         except FileNotFoundError:
-            pass  # the one that listed the folder
+            pass  # the one that listed the folder, or one that was closed meanwhile
     return found

@@ -156,28 +156,23 @@ def test_an_almost_empty_environment(launch_on: Callable[..., Program]) -> None:
 
 
 FIRST_PROCESS = """
-    import contextlib, fiber, os, subprocess, sys
-    from pathlib import Path
+    import census, fiber, os, subprocess
     from faults.program import wait_for
 
     def leave_orphans():
         for _ in range(5):
             subprocess.Popen(["sh", "-c", "sleep 0.1 &"]).wait()
 
-    def processes():
-        found = []
-        for number in filter(str.isdecimal, os.listdir("/proc")):
-            with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # it is gone by now
-                found.append(Path("/proc", number, "stat").read_text().split()[1:3])
-        return found
+    def is_orphan(found):
+        return "sleep" in found.command or found.command == "[sh]"
 
     if __name__ == "__main__":
         print(os.getpid())
         child = fiber.Process(target=leave_orphans)
         child.start()
         child.join()
-        wait_for(lambda: not any(name in ("(sleep)", "(sh)") for name, _ in processes()))
-        print([name for name, state in processes() if state == "Z"])
+        wait_for(lambda: not any(map(is_orphan, census.everything())))
+        print([found.command for found in census.everything() if found.state == "Z"])
 """
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import json
 import os
@@ -18,6 +17,7 @@ from pathlib import Path
 
 import pytest
 
+import leaks
 from faults.program import Program, wait_for
 from fiber._transport.credentials import WarmCredentials
 from ports import reserved_port
@@ -137,11 +137,7 @@ def descriptors(program: Program) -> list[str]:
     found: list[str] = []
 
     def is_made() -> bool:
-        found.clear()
-        for descriptor in Path(f"/proc/{program.pid}/fd").iterdir():
-            with contextlib.suppress(FileNotFoundError):  # it was closed meanwhile
-                if int(descriptor.name) > 2:
-                    found.append(os.readlink(descriptor))
+        found[:] = [target for fd, target in leaks.descriptors(program.pid) if fd > 2]
         sockets = [name for name in found if name.startswith("socket:")]
         return len(sockets) == len(set(sockets)) and any(name.startswith("pipe:") for name in found)
 

@@ -10,7 +10,7 @@ import signal
 import threading
 from array import array
 from collections.abc import Callable
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext
 from multiprocessing.connection import wait
 from types import SimpleNamespace
 from typing import Any
@@ -27,7 +27,7 @@ from fiber._transport.channels import UnixChannel
 from fiber._wire.packet import Message
 from fiber.connection import Connection, Pipe
 from fiber.errors import ConnectionClosed, UnpicklableError
-from leaks import HEAP
+from leaks import HEAP, descriptors
 from patience import PATIENCE
 from processes.test_loopback import running
 
@@ -325,11 +325,7 @@ def open_descriptors() -> int:
 
     Another segment of that memory comes whenever the places in the last one are taken.
     """
-    found = 0
-    for number in os.listdir("/proc/self/fd"):
-        with suppress(FileNotFoundError):  # it was the descriptor of the folder
-            found += os.readlink(f"/proc/self/fd/{number}") != HEAP
-    return found
+    return sum(target != HEAP for _, target in descriptors())
 
 
 def test_sending_connections_leaves_no_descriptor_behind() -> None:
