@@ -130,7 +130,7 @@ class Person:
         """Return the name of a program's pod once it is there."""
 
         def found() -> str | None:
-            for pod in list(self.scene.now["pods"].values()):
+            for pod in self.scene.now["pods"].values():
                 if pod["metadata"]["labels"].get(names.LABEL_PROGRAM) == name:
                     return str(pod["metadata"]["name"])
             return None

@@ -97,7 +97,7 @@ class Pool:
     @property
     def pods(self) -> list[Body]:
         """All of its pods, the oldest first."""
-        mine = [pod for pod in list(self.scene.now["pods"].values()) if self.owns(pod)]
+        mine = [pod for pod in self.scene.now["pods"].values() if self.owns(pod)]
         return sorted(mine, key=lambda pod: pod["metadata"]["creationTimestamp"])
 
     @property

@@ -6,7 +6,6 @@ import json
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -32,16 +31,6 @@ class Moment:
     @property
     def name(self) -> str:
         return str(self.object["metadata"]["name"])
-
-
-@contextmanager
-def watching(scene: Scene, *resources: str) -> Iterator[Scene]:
-    """The same namespace, and other resources in it."""
-    other = Scene(scene.kube, scene.namespace, resources)
-    try:
-        yield other
-    finally:
-        other.close()
 
 
 class NotSo(AssertionError):
@@ -151,13 +140,15 @@ class Scene:
     def _note(self, resource: str, news: Sequence[tuple[bool, Body]]) -> None:
         at = time.monotonic()
         with self._changed:
+            there = dict(self.now[resource])  # a reader may go through the one of before
             for gone, body in news:
                 name = body["metadata"]["name"]
                 self.moments.append(Moment(at, resource, gone, body))
                 if gone:
-                    self.now[resource].pop(name, None)
+                    there.pop(name, None)
                 else:
-                    self.now[resource][name] = body
+                    there[name] = body
+            self.now[resource] = there
             self._changed.notify_all()
 
     # For a person

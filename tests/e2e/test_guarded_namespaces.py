@@ -12,6 +12,7 @@ from e2e.kube import Body, path_of
 from e2e.leftovers import leaves_nothing
 from e2e.pools import is_ready
 from e2e.program import Programs
+from e2e.quotas import make_quota
 from e2e.scene import Scene
 from e2e.test_drain import squares
 from e2e.test_program import ever, is_worker, workers
@@ -29,9 +30,7 @@ def restricted(scene: Scene) -> None:
 
 
 def quota_on_requests(scene: Scene) -> None:
-    hard = {"requests.cpu": "1", "requests.memory": "1Gi"}
-    body = {"metadata": {"name": "requests"}, "spec": {"hard": hard}}
-    scene.kube.create(scene.path("resourcequotas"), body)
+    make_quota(scene, "requests", **{"requests.cpu": "1", "requests.memory": "1Gi"})
 
 
 def limit_range(scene: Scene) -> None:

@@ -39,7 +39,7 @@ def laptop(cluster: Cluster, programs: Programs) -> Iterator[Laptop]:
 
 def relays(scene: Scene) -> list[Body]:
     """Return the pods of relays that are Ready."""
-    pods = list(scene.now["pods"].values())
+    pods = scene.now["pods"].values()
     return [pod for pod in pods if names.LABEL_RELAY in pod["metadata"]["labels"] and is_ready(pod)]
 
 
@@ -163,7 +163,7 @@ def test_one_relay_carries_the_agents_of_many_pods(
     (relay,) = scene.wait("a relay is ready", lambda: relays(scene), 60)
 
     def workers() -> bool:
-        pods = list(scene.now["pods"].values())
+        pods = scene.now["pods"].values()
         ours = [pod for pod in pods if names.LABEL_RELAY not in pod["metadata"]["labels"]]
         return len([pod for pod in ours if is_ready(pod)]) == PODS
 

@@ -23,7 +23,7 @@ GPU = "nvidia.com/gpu"
 
 def workers(scene: Scene) -> list[Body]:
     """The pods of pools that are there."""
-    return [pod for pod in list(scene.now["pods"].values()) if is_worker(pod)]
+    return [pod for pod in scene.now["pods"].values() if is_worker(pod)]
 
 
 def is_worker(pod: Body) -> bool:

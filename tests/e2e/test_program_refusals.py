@@ -15,6 +15,7 @@ from e2e.kube import Body, Refused, path_of
 from e2e.leftovers import leaves_nothing
 from e2e.pools import Pool, says
 from e2e.program import Programs
+from e2e.quotas import make_quota
 from e2e.release import Release
 from e2e.scene import Scene
 from fiber_api import names
@@ -29,17 +30,6 @@ def no_pods_allowed(scene: Scene) -> None:
 
 def quota_on_requests(scene: Scene) -> None:
     make_quota(scene, "counted", **{"requests.memory": "1Gi"})
-
-
-def make_quota(scene: Scene, name: str, **hard: str) -> None:
-    """Make a ResourceQuota, and wait until it is in force."""
-    path = scene.path("resourcequotas")
-    scene.kube.create(path, {"metadata": {"name": name}, "spec": {"hard": hard}})
-
-    def limits() -> object:
-        return (scene.kube.get(f"{path}/{name}") or {}).get("status", {}).get("hard")
-
-    scene.wait("the quota is in force", limits, poll=0.2)
 
 
 def limits(**kinds: str) -> Callable[[Scene], None]:

@@ -11,7 +11,8 @@ from contract.bad_manifests import BAD, BAD_UPDATES, DUPLICATE_RELEASE, GOOD, Ba
 from e2e.delays import record
 from e2e.kube import JSON_PATCH, Body, Failed, Kube, Refused, path_of
 from e2e.pools import Pool, condition_in, problem_in, says
-from e2e.scene import Scene, watching
+from e2e.quotas import make_quota
+from e2e.scene import Scene
 from e2e.test_apply import SOMEWHERE
 
 DRY = {"dryRun": "All", "fieldValidation": "Strict"}
@@ -75,11 +76,7 @@ def test_an_epoch_is_remembered_after_its_master(pool: Pool, agent: Body) -> Non
 
 def test_a_quota_that_refuses_pods_is_a_problem(pool: Pool, agent: Body) -> None:
     scene = pool.scene
-    quota = scene.path("resourcequotas")
-    with watching(scene, "resourcequotas") as quotas:
-        body = {"metadata": {"name": "small"}, "spec": {"hard": {"pods": "2"}}}
-        scene.kube.create(quota, body)
-        quotas.wait("the quota is in force", lambda: _hard(quotas.now["resourcequotas"]))
+    make_quota(scene, "small", pods="2")
     pool.apply(agent, minReplicas=4, failurePolicy=QUICK)
     problem = pool.has_problem("QuotaExceeded", severity="Error")
     assert says(problem["message"], "quota", "exceeded quota: small", "raise the ResourceQuota")
@@ -90,7 +87,7 @@ def test_a_quota_that_refuses_pods_is_a_problem(pool: Pool, agent: Body) -> None
     second = sorted(scene.first("pods", _is(name)) for name in pool.ever)[1]
     told = scene.first("fiberpools", lambda body: problem_in(body, "QuotaExceeded"))
     record("a quota is exceeded", told - second)
-    scene.kube.patch(f"{quota}/small", {"spec": {"hard": {"pods": "9"}}})
+    scene.kube.patch(scene.path("resourcequotas", "small"), {"spec": {"hard": {"pods": "9"}}})
     pool.ready(4)
     assert not pool.status["problems"]
 
@@ -188,10 +185,6 @@ def _with_mount(agent: Body) -> Body:
     (worker,) = agent["spec"]["containers"]
     mounts = [{"name": "nothing", "mountPath": "/nothing"}]
     return {"spec": {**agent["spec"], "containers": [{**worker, "volumeMounts": mounts}]}}
-
-
-def _hard(quotas: dict[str, Body]) -> object:
-    return quotas.get("small", {}).get("status", {}).get("hard")
 
 
 def _is(name: str) -> Any:

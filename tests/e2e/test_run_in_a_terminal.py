@@ -63,7 +63,7 @@ def person(scene: Scene, programs: Programs, cluster: Cluster, tmp_path: Path) -
 
 def runs(person: Person) -> bool:
     """Return whether the program's pod runs."""
-    pods = list(person.scene.now["pods"].values())
+    pods = person.scene.now["pods"].values()
     return any(pod["status"]["phase"] == "Running" for pod in pods)
 
 
@@ -143,7 +143,7 @@ def test_stop_lets_a_program_end_and_stop_now_does_not(person: Person) -> None:
 
 def worker(person: Person) -> Body | None:
     """Return the pod of a worker that is Ready."""
-    pods = list(person.scene.now["pods"].values())
+    pods = person.scene.now["pods"].values()
     ours = (pod for pod in pods if names.LABEL_POOL in pod["metadata"]["labels"])
     return next((pod for pod in ours if is_ready(pod)), None)
 
